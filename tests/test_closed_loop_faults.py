@@ -538,12 +538,20 @@ def test_a_robot_that_fails(tmp_path: Path, how: str, words: str, monkeypatch: p
     assert not session.episodes[0].is_whole
 
 
+@pytest.mark.parametrize("answers_at_last", [False, pytest.param(True, marks=pytest.mark.oracle)])
 def test_a_robot_that_hangs_leaves_the_response_it_did_not_move_by(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, answers_at_last: bool
 ) -> None:
-    from animat.closed_loop import runner
+    from animat.closed_loop import runner, running
 
-    released, steps = threading.Event(), [0]
+    released, steps, write = threading.Event(), [0], running._Supervisor._write
+
+    def write_after_the_answer(supervisor: Any) -> None:
+        """It comes just after the response without it was taken down to be written."""
+        if answers_at_last and supervisor._driver.is_stopped:
+            released.set()
+            next(thread for thread in threading.enumerate() if thread.name == "closed loop").join(10)
+        write(supervisor)
 
     class StuckRunner(runner.RobotRunner):
         def __init__(self, *given: Any) -> None:
@@ -559,7 +567,8 @@ def test_a_robot_that_hangs_leaves_the_response_it_did_not_move_by(
             self.step = stuck  # type: ignore[method-assign]
 
     monkeypatch.setattr(runner, "RobotRunner", StuckRunner)
-    monkeypatch.setattr("animat.closed_loop.running._GRACE_S", 0.2)
+    monkeypatch.setattr(running._Supervisor, "_write", write_after_the_answer)
+    monkeypatch.setattr(running, "_GRACE_S", 0.2)
     with FakeCulture() as culture:
         try:
             session = run(tmp_path, culture, patience_s=0.3)
@@ -569,7 +578,7 @@ def test_a_robot_that_hangs_leaves_the_response_it_did_not_move_by(
         finally:
             released.set()
         assert culture.pulses == session.to_dict()["pulses"] == 7
-    assert [tick.handled for tick in session.ticks] == ["used"] * 6 + ["unfinished"]
+    assert [tick.handled for tick in session.ticks] == ["used"] * 6 + ["used" if answers_at_last else "unfinished"]
     assert session.to_dict()["unanswered_pulses"] == 0
 
 

@@ -209,7 +209,7 @@ class _Supervisor:
         done: float = sum(map(len, returns.values()))
         note = "warm-up"
         if episode is not None:
-            done += 0 if episode.is_whole else min(1.0, episode.iterations / self._loop.robot.episode_limit)
+            done += 0 if episode.is_whole else episode.iterations / self._loop.robot.episode_limit
             note = f"{episode.agent}: return {episode.total:.1f}{'' if episode.is_whole else ' so far'}"
         if returns:
             note += f"; means: {', '.join(f'{name} {fmean(of):.1f}' for name, of in returns.items())}"
