@@ -630,6 +630,10 @@ def test_a_session_needs_an_open_culture_agents_and_a_folder_of_its_own(tmp_path
             run_session(culture, loop_of(patterns=9), [RANDOM], tmp_path)
         with pytest.raises(InvalidArgument, match="episodes"):
             run_session(culture, loop_of(), [RANDOM], tmp_path, episodes=0)
+        for wrong in ({"episodes": 1.5}, {"episodes": [True]}, {"seed": 0.5}):
+            (name,) = wrong
+            with pytest.raises(InvalidArgument, match=f"{name}: expected a whole number, got (1.5|True|0.5)"):
+                run_session(culture, loop_of(), [RANDOM], tmp_path, **wrong)  # type: ignore[arg-type]
         strong = Pulse((Phase(200, amplitude_mv=-2000), Phase(200, amplitude_mv=2000)))
         with pytest.raises(UnsafeStimulus, match="amplitude: expected -400 to 400 mV, got -2000"):
             run_session(culture, loop_of(pulse=strong), [RANDOM], tmp_path)
@@ -650,11 +654,14 @@ def test_what_is_predicted_stands_in_the_log(tmp_path: Path) -> None:
             run_session(culture, loop_of(), [RANDOM], tmp_path, predicted={"someone": Interval(1.5, 1.0, 2.0, 0.95)})
         predicted = {"random": Interval(1.5, 1.0, 2.0, 0.95)}
         session = run_session(culture, loop_of(), [RANDOM], tmp_path / "with", episodes=1, predicted=predicted)
-        without = run_session(culture, loop_of(), [RANDOM], tmp_path / "without", episodes=1)
+        # Numbers of numpy are numbers too.
+        counts: Any = {"episodes": np.int64(1), "seed": np.int64(7)}
+        without = run_session(culture, loop_of(), [RANDOM], tmp_path / "without", **counts)
     assert session.log.header["predicted"] == {"random": {"mean": 1.5, "low": 1.0, "high": 2.0}}
     # The fake's clock was at 12 s.
     assert session.log.header["start_min"] == session.recording().start_min == 0.2
-    assert "predicted" not in without.log.header
+    assert "predicted" not in without.log.header and without.log.header["seed"] == 7
+    assert [episode.is_whole for episode in without.episodes] == [True]
 
 
 def test_the_heuristic_policy_steers_the_right_way() -> None:

@@ -52,6 +52,7 @@ from animat.recordings.recorded_culture import RecordedCulture
 from animat.recordings.recording import Recording
 from animat.responses.condition import Condition
 from animat.responses.extraction import extract_responses
+from animat.responses.quality.drift import LARGE
 from animat.responses.responses import Responses
 from animat.robots import Cartpole, Navigation, Robot, Shuttle
 from animat.stimulation.array import MAXONE
@@ -310,6 +311,14 @@ def test_responses_to_policies_agree_with_the_log_and_the_adaptive_median(withou
     np.testing.assert_array_equal(presented.condition, [tick.delivered for tick in every])
     np.testing.assert_array_equal(presented.is_rested, [tick.iteration == 0 for tick in every])
     assert [every[row] for row in place] == ticks
+
+
+@pytest.mark.usefixtures("few_bootstraps")
+def test_drift_is_foreseen_from_the_start_of_the_session_on(without_controls: Ran, series: list[Responses]) -> None:
+    gap, drift = without_controls[0], Calibration.of_series(series).drift
+    assert drift is not None and np.all(np.isfinite(drift.minutes_to(LARGE)))
+    since_min = gap.session.log.header["start_min"] - series[-1].start_min
+    assert gap.outlook.drifted_min == pytest.approx([each - since_min for each in drift.minutes_to(LARGE)])
 
 
 def test_controls_have_no_more_episodes_than_the_policies_but_five_each() -> None:
@@ -785,6 +794,8 @@ def test_a_recording_much_older_than_the_culture_is_reported(
         gap = run_policies(
             {"p0": policy_of(0, series)}, culture, calibration, tmp_path, episodes=1, with_controls=False
         )
+    # A single policy has one row.
+    assert [row.name for row in gap.rows] == ["p0", "random"]
     found = [finding for finding in gap.findings if finding.name == "old-calibration"]
     assert [finding.value for finding in found] == ([pytest.approx(age_min)] if warned else [])
 
