@@ -125,8 +125,11 @@ def test_the_table_holds_what_the_simulator_and_the_session_say(
     tmp_path: Path, series: list[Responses], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("animat.reality_gap.calibration.BOOTSTRAPS", 40)
-    gap, policies = run(tmp_path, series)
+    gap, policies = run(tmp_path, series, account=Account(Budget(pulses=1_000_000)))
     rows = {row.name: row for row in gap.rows}
+    # Foreseen is what was delivered then.
+    lasts_min = gap.outlook.planned_min * 1_000_000 / gap.account.pulses
+    assert gap.outlook.budget_min == pytest.approx(lasts_min, rel=0.01)
     constants = [f"constant {hz} Hz" for hz in (5, 10, 20, 40, 80)]
     assert list(rows) == ["policies", "p0", "p1", "random", *constants, "silent", "shuffled", "heuristic"]
     assert gap.session.ending.by == "plan"
