@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import csv
+import gc
 import os
 import re
+import sys
 import threading
 import time
 from collections import Counter
@@ -292,10 +294,12 @@ def test_the_time_to_decide_is_counted_from_the_data_and_a_pause_is_none_of_it(t
 def test_a_loop_with_deadlines_runs_ahead_of_other_programs_where_it_may(tmp_path: Path, real_time: bool) -> None:
     seen: set[int] = set()
     of_those_it_starts: set[int] = set()
+    interpreter: set[tuple[bool, float]] = set()
 
     class Noting(AnyCondition):
         def act(self, observation: Any, rng: np.random.Generator) -> int:
             seen.add(os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK)
+            interpreter.add((gc.isenabled(), round(sys.getswitchinterval(), 6)))
             with ThreadPoolExecutor(1) as started:
                 of_those_it_starts.add(started.submit(os.sched_getscheduler, 0).result())
             return super().act(observation, rng)
@@ -307,9 +311,12 @@ def test_a_loop_with_deadlines_runs_ahead_of_other_programs_where_it_may(tmp_pat
 
     if real_time and not may():
         pytest.skip("the system gives no real-time priority")
-    before = os.sched_getscheduler(0)
+    before, usual = os.sched_getscheduler(0), (gc.isenabled(), sys.getswitchinterval())
     with FakeCulture() as culture:
         run_session(culture, loop_of(real_time=real_time), [Agent("noting", "", Noting(5))], tmp_path, episodes=1)
+    # No garbage is collected meanwhile, and no thread keeps the interpreter for long.
+    assert interpreter == {(False, 0.0002)}
+    assert (gc.isenabled(), sys.getswitchinterval()) == usual == (True, usual[1])
     assert seen == {os.SCHED_RR if real_time else before}
     assert of_those_it_starts == {before}
     assert os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == before
@@ -370,7 +377,7 @@ def test_the_silent_control_gives_no_pulse_and_the_shuffled_one_another_conditio
     inside = (-since_ms >= 2.0 - 1e-6) & (-since_ms < 10.0 - 1e-6)
     assert [tick.spikes for tick in silent] == inside.sum(axis=1).tolist() != [0] * 60
     # All that was seen is recorded, the pauses too: this culture's clock stands still in between.
-    assert recording.duration_s == pytest.approx(culture.now_s - 12.0, abs=1e-4)
+    assert recording.duration_s == pytest.approx(culture.now_s - 12.0, abs=1e-9)
     assert recording.provenance["closed_loop_unwatched_s"] == "0.000000"
     shuffled = [tick.delivered for tick in session.ticks if tick.agent == "any"]
     assert {tick.chosen for tick in session.ticks if tick.agent == "any"} == {4}
@@ -419,6 +426,10 @@ def test_each_condition_leads_in_before_an_episode_and_moves_nothing(tmp_path: P
         assert ticks[len(warming)].iteration == 0
         assert episode.iterations == 6
         assert episode.pulses == sum(len(tick.pulse_time_s) for tick in ticks)
+        moving = ticks[len(warming) :]
+        assert episode.warm_up_pulses == 2 * len(warming)
+        assert (episode.trials, episode.bursts) == (len(moving), sum(tick.is_burst for tick in moving))
+    assert session.outline.bursts == sum(tick.is_burst for tick in session.ticks)
     assert_read_alike(tmp_path / "two", loop)
     # The robot stands until the policy's first choice.
     with FakeCulture() as culture:
@@ -461,14 +472,17 @@ def test_the_notes_of_a_session_from_its_warm_up_on(tmp_path: Path) -> None:
         time.sleep(0.3 if culture.deliveries == 1 else 0.01)
         return observed
 
-    notes: list[str] = []
-    progress = SimpleNamespace(update=lambda done, total, note: notes.append(note))
+    said: list[tuple[float, str]] = []
+    progress = SimpleNamespace(update=lambda done, total, note: said.append((done, note)))
     loop = loop_of(robot=Navigation(episode_limit=20), warm_up=2)
     with FakeCulture(fault=slowly, at=0) as culture:
         session = run_session(culture, loop, [RANDOM], tmp_path, episodes=1, progress=progress)
     total = f"{session.episodes[0].total:.1f}"
+    notes, parts = [note for _, note in said], [done for done, _ in said]
     assert notes[0] == "warm-up" and notes[-1] == f"random: return {total}; means: random {total}"
     assert any(re.fullmatch(r"random: return \S+ so far", note) for note in notes)
+    # In twentieths of the episode.
+    assert any(0 < part < 1 for part in parts) and {round(20 * part, 9) for part in parts} <= {*range(21)}
 
 
 def test_only_adaptive_thresholds_of_single_pulses_settle() -> None:
@@ -616,6 +630,10 @@ def test_a_session_needs_an_open_culture_agents_and_a_folder_of_its_own(tmp_path
             run_session(culture, loop_of(patterns=9), [RANDOM], tmp_path)
         with pytest.raises(InvalidArgument, match="episodes"):
             run_session(culture, loop_of(), [RANDOM], tmp_path, episodes=0)
+        for wrong in ({"episodes": 1.5}, {"episodes": [True]}, {"seed": 0.5}):
+            (name,) = wrong
+            with pytest.raises(InvalidArgument, match=f"{name}: expected a whole number, got (1.5|True|0.5)"):
+                run_session(culture, loop_of(), [RANDOM], tmp_path, **wrong)  # type: ignore[arg-type]
         strong = Pulse((Phase(200, amplitude_mv=-2000), Phase(200, amplitude_mv=2000)))
         with pytest.raises(UnsafeStimulus, match="amplitude: expected -400 to 400 mV, got -2000"):
             run_session(culture, loop_of(pulse=strong), [RANDOM], tmp_path)
@@ -636,9 +654,14 @@ def test_what_is_predicted_stands_in_the_log(tmp_path: Path) -> None:
             run_session(culture, loop_of(), [RANDOM], tmp_path, predicted={"someone": Interval(1.5, 1.0, 2.0, 0.95)})
         predicted = {"random": Interval(1.5, 1.0, 2.0, 0.95)}
         session = run_session(culture, loop_of(), [RANDOM], tmp_path / "with", episodes=1, predicted=predicted)
-        without = run_session(culture, loop_of(), [RANDOM], tmp_path / "without", episodes=1)
+        # Numbers of numpy are numbers too.
+        counts: Any = {"episodes": np.int64(1), "seed": np.int64(7)}
+        without = run_session(culture, loop_of(), [RANDOM], tmp_path / "without", **counts)
     assert session.log.header["predicted"] == {"random": {"mean": 1.5, "low": 1.0, "high": 2.0}}
-    assert "predicted" not in without.log.header
+    # The fake's clock was at 12 s.
+    assert session.log.header["start_min"] == session.recording().start_min == 0.2
+    assert "predicted" not in without.log.header and without.log.header["seed"] == 7
+    assert [episode.is_whole for episode in without.episodes] == [True]
 
 
 def test_the_heuristic_policy_steers_the_right_way() -> None:
@@ -682,6 +705,20 @@ def test_what_the_device_left_out_is_reported(tmp_path: Path) -> None:
         session = run_session(culture, loop_of(), [RANDOM], tmp_path, episodes=1)
     assert session.outline.left_out == session.to_dict()["left_out"] == {"frames lost": 7}
     assert read_recording(session.recording_file).provenance["left_out"] == "7 frames lost"
+
+
+def test_unanswered_pulses_are_counted_in_whatever_order_threads_write() -> None:
+    of: dict[str, Any] = {"stretch": 0, "stimuli": [[5.0, 0, 0, [100, 101]]], "tick": None}
+    asked, seen, failed = ({"kind": kind, **of} for kind in ("asked", "seen", "event"))
+    refused = failed | {"is_admitted": False}
+    for records, pulses in (
+        ([asked], 1), ([asked, seen], 0), ([seen, asked], 0), ([asked, failed], 1), ([failed, asked], 1),
+        ([asked, refused], 0), ([refused, asked], 0),
+    ):  # fmt: skip
+        outline = Outline()
+        for record in records:
+            outline.add(record)
+        assert outline.unanswered_pulses == pulses, records
 
 
 def test_policies_take_turns_under_a_control(tmp_path: Path) -> None:

@@ -347,7 +347,7 @@ def test_a_policy_that_hangs(tmp_path: Path, is_interrupted: bool, little_grace:
         assert culture.pulses == pulses
 
 
-@pytest.mark.parametrize("how", ["raises", "hangs"])
+@pytest.mark.parametrize("how", ["takes a while", "raises", "hangs"])
 def test_a_culture_that_cannot_stop_is_reported(tmp_path: Path, how: str, monkeypatch: pytest.MonkeyPatch) -> None:
     released = threading.Event()
     monkeypatch.setattr("animat.closed_loop.running._GRACE_S", 0.2)
@@ -356,15 +356,18 @@ def test_a_culture_that_cannot_stop_is_reported(tmp_path: Path, how: str, monkey
         def _halt(self) -> None:
             if how == "raises":
                 raise ConnectionResetError("gone")
-            released.wait(60)
+            released.wait(0.02 if how == "takes a while" else 60)
 
     with Unstoppable(fault=raising(RuntimeError("smoke")), at=8) as culture:
         try:
             session = run(tmp_path, culture)
         finally:
             released.set()
-        assert "got RuntimeError: smoke; BUT the culture" in session.ending.message
-        assert "make sure that the device delivers no more pulses" in session.ending.message
+        if how == "takes a while":
+            assert session.ending.message.endswith("got RuntimeError: smoke")
+        else:
+            assert "got RuntimeError: smoke; BUT the culture" in session.ending.message
+            assert "make sure that the device delivers no more pulses" in session.ending.message
         # Whatever the device does: nothing passes the guard.
         with pytest.raises(UnsafeStimulus, match="stop"):
             culture.stimulate(culture.stimulation_electrodes[:1], session_pulse())
@@ -383,6 +386,7 @@ def test_a_later_pulse_of_a_presentation_that_comes_late_is_late(tmp_path: Path)
     late = {tick.number: tick.late_s for tick in session.ticks if tick.late_s > 0}
     assert late == {7: pytest.approx(0.007, abs=1e-4)}
     assert session.to_dict()["late_pulses"] == 1
+    assert session.to_dict()["latest_ms"] == pytest.approx(7.0, abs=0.1)
 
 
 def test_a_backend_that_hangs(tmp_path: Path, little_grace: None) -> None:
@@ -486,7 +490,8 @@ class Broken:
                 return moved
             if self.how == "raises":
                 raise ZeroDivisionError("the wheel came off")
-            return moved._replace(truncated=True) if self.how == "stops" else moved._replace(reward=float("nan"))
+            ends = {"truncated": True, "terminated": self.how == "falls"}
+            return moved._replace(**({"reward": float("nan")} if self.how == "nan" else ends))
 
         return broken
 
@@ -504,15 +509,21 @@ def break_robot(how: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(runner, "RobotRunner", BrokenRunner)
 
 
-def test_a_robot_that_cuts_its_episode_off_ends_it_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    break_robot("stops", monkeypatch)
+@pytest.mark.parametrize("how", ["stops", "falls"])
+def test_a_robot_that_cuts_its_episode_off_or_falls_ends_it_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, how: str
+) -> None:
+    break_robot(how, monkeypatch)
     with FakeCulture() as culture:
         session = run(tmp_path, culture)
         assert session.ending.by == "plan"
         assert culture.pulses == 11
     # It does so in its seventh step and in every later one.
     assert [episode.iterations for episode in session.episodes] == [7, 1, 1, 1, 1]
-    assert all(episode.is_whole and not episode.terminated for episode in session.episodes)
+    assert all(episode.is_whole and episode.terminated == (how == "falls") for episode in session.episodes)
+    # Who falls is not cut off as well.
+    ends = [(tick.terminated, tick.truncated) for tick in session.ticks]
+    assert ends == [(False, False)] * 6 + [(how == "falls", how == "stops")] * 5
 
 
 @pytest.mark.parametrize(("how", "words"), [("raises", "the wheel came off"), ("nan", "with reward nan")])
@@ -527,12 +538,20 @@ def test_a_robot_that_fails(tmp_path: Path, how: str, words: str, monkeypatch: p
     assert not session.episodes[0].is_whole
 
 
+@pytest.mark.parametrize("answers_at_last", [False, pytest.param(True, marks=pytest.mark.oracle)])
 def test_a_robot_that_hangs_leaves_the_response_it_did_not_move_by(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, answers_at_last: bool
 ) -> None:
-    from animat.closed_loop import runner
+    from animat.closed_loop import runner, running
 
-    released, steps = threading.Event(), [0]
+    released, steps, write = threading.Event(), [0], running._Supervisor._write
+
+    def write_after_the_answer(supervisor: Any) -> None:
+        """It comes just after the response without it was taken down to be written."""
+        if answers_at_last and supervisor._driver.is_stopped:
+            released.set()
+            next(thread for thread in threading.enumerate() if thread.name == "closed loop").join(10)
+        write(supervisor)
 
     class StuckRunner(runner.RobotRunner):
         def __init__(self, *given: Any) -> None:
@@ -548,7 +567,8 @@ def test_a_robot_that_hangs_leaves_the_response_it_did_not_move_by(
             self.step = stuck  # type: ignore[method-assign]
 
     monkeypatch.setattr(runner, "RobotRunner", StuckRunner)
-    monkeypatch.setattr("animat.closed_loop.running._GRACE_S", 0.2)
+    monkeypatch.setattr(running._Supervisor, "_write", write_after_the_answer)
+    monkeypatch.setattr(running, "_GRACE_S", 0.2)
     with FakeCulture() as culture:
         try:
             session = run(tmp_path, culture, patience_s=0.3)
@@ -558,7 +578,7 @@ def test_a_robot_that_hangs_leaves_the_response_it_did_not_move_by(
         finally:
             released.set()
         assert culture.pulses == session.to_dict()["pulses"] == 7
-    assert [tick.handled for tick in session.ticks] == ["used"] * 6 + ["unfinished"]
+    assert [tick.handled for tick in session.ticks] == ["used"] * 6 + ["used" if answers_at_last else "unfinished"]
     assert session.to_dict()["unanswered_pulses"] == 0
 
 

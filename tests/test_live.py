@@ -42,7 +42,7 @@ from animat.recordings.reading import read_recordings
 from animat.responses.extraction import extract_responses
 from animat.robots import Navigation
 from animat.stimulation.protocol import Protocol
-from animat.stimulation.pulse import PUBLISHED_PULSE
+from animat.stimulation.pulse import BALANCED_PULSE, PUBLISHED_PULSE
 from animat.stimulation.stimulus import Stimulus
 from animat.training.policy import load_policies
 from animat.training.settings import SAC
@@ -58,7 +58,7 @@ TRAINING = Training(Navigation(episode_limit=8), Thresholds(1), policies=2, iter
 ONE = replace(TRAINING, policies=1)
 """In one process: for what has nothing to do with how many train."""
 PROTOCOL = Protocol(order="mixed", pulses=2, patterns=8, trials=40, setup_s=0.1)
-BLOCKED = replace(PROTOCOL, order="blocked")
+BLOCKED = replace(PROTOCOL, order="blocked", pulse=BALANCED_PULSE, patterns=7)
 PULSES = 5 * 40 * 2
 QUICK = Timetable(interval_min=10, duration_min=30, speed=1e6)
 
@@ -91,7 +91,7 @@ def ran(tmp_path_factory: pytest.TempPathFactory, seen: Seen) -> tuple[LiveRun, 
     with pytest.MonkeyPatch.context() as patch, FakeCulture() as culture:
         patch.setattr(under_way, "EVERY_S", 0.0)
         patch.setattr(shadowing, "PartialRecording", Watched)
-        found = live(TRAINING, culture, BLOCKED, folder, timetable=QUICK, episodes=3)
+        found = live(TRAINING, culture, BLOCKED, folder, timetable=QUICK, episodes=3, kind="empirical")
         return found, folder, culture.delivered
 
 
@@ -160,6 +160,11 @@ def test_the_loop_runs_with_what_was_trained_on_last(ran: tuple[LiveRun, Path, i
     assert gap.session.ending.by == "plan"
     assert [row.name for row in gap.rows] == ["policies", "p0", "p1", "random"]
     assert gap.loop.adaptive_from is not None
+    assert {policy.provenance["simulators"]["kind"] for policy in found.policies.values()} == {"empirical"}
+    assert not {finding.name for finding in gap.findings} & {"other-simulator", "old-calibration"}
+    # Stimulated as it was recorded.
+    assert (gap.loop.pulse, gap.loop.pulses, gap.loop.patterns) == (BALANCED_PULSE, 2, 7)
+    assert gap.session.log.header["seed"] == TRAINING.seed
     series = [extract_responses(recording) for recording in read_recordings([folder / "recordings"])]
     expected = fit_timeline(series).simulators.percentiles[-1]
     np.testing.assert_array_equal(gap.loop.percentiles, np.asarray(expected))
@@ -318,7 +323,8 @@ def test_a_recording_that_cannot_be_used_is_kept_and_passed_over(tmp_path: Path)
 
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr("animat.live.shadowing.extract_series", extract)
-            found = live(ONE, culture, PROTOCOL, tmp_path / "live", timetable=QUICK, episodes=1)
+            found = live(ONE, culture, PROTOCOL, tmp_path / "live", timetable=QUICK, episodes=1, adaptive=False)
+    assert found.gap.loop.adaptive_from is None
     assert len(found.recordings) == 3
     assert len(found.swaps) == 1
     assert [line["message"] for line in lines(tmp_path / "live") if line["what"] == "unusable"] == ["a dead window"]

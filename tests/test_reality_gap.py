@@ -52,6 +52,7 @@ from animat.recordings.recorded_culture import RecordedCulture
 from animat.recordings.recording import Recording
 from animat.responses.condition import Condition
 from animat.responses.extraction import extract_responses
+from animat.responses.quality.drift import LARGE
 from animat.responses.responses import Responses
 from animat.robots import Cartpole, Navigation, Robot, Shuttle
 from animat.stimulation.array import MAXONE
@@ -124,8 +125,11 @@ def test_the_table_holds_what_the_simulator_and_the_session_say(
     tmp_path: Path, series: list[Responses], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("animat.reality_gap.calibration.BOOTSTRAPS", 40)
-    gap, policies = run(tmp_path, series)
+    gap, policies = run(tmp_path, series, account=Account(Budget(pulses=1_000_000)))
     rows = {row.name: row for row in gap.rows}
+    # Foreseen is what was delivered then.
+    lasts_min = gap.outlook.planned_min * 1_000_000 / gap.account.pulses
+    assert gap.outlook.budget_min == pytest.approx(lasts_min, rel=0.01)
     constants = [f"constant {hz} Hz" for hz in (5, 10, 20, 40, 80)]
     assert list(rows) == ["policies", "p0", "p1", "random", *constants, "silent", "shuffled", "heuristic"]
     assert gap.session.ending.by == "plan"
@@ -290,6 +294,10 @@ def test_responses_to_policies_agree_with_the_log_and_the_adaptive_median(withou
         if not tick.is_burst:
             # Two pulses per trial: neurons have no memory.
             thresholds.add(tick.delivered, HistoryState(), np.array(tick.rate_hz))
+    for row in gap.rows[1:]:
+        is_burst = [tick.is_burst for tick in gap.session.ticks if tick.agent == row.name]
+        assert (row.bursts, row.late) == (sum(is_burst) / len(is_burst), 0.0)
+    assert gap.rows[0].bursts == sum(tick.is_burst for tick in ticks) / len(ticks) > 0
     found = read_responses(gap.session, gap.loop, tuple(policies))
     np.testing.assert_array_equal(found.command, commands)
     np.testing.assert_array_equal(found.responses.condition, [tick.delivered for tick in ticks])
@@ -306,6 +314,14 @@ def test_responses_to_policies_agree_with_the_log_and_the_adaptive_median(withou
     np.testing.assert_array_equal(presented.condition, [tick.delivered for tick in every])
     np.testing.assert_array_equal(presented.is_rested, [tick.iteration == 0 for tick in every])
     assert [every[row] for row in place] == ticks
+
+
+@pytest.mark.usefixtures("few_bootstraps")
+def test_drift_is_foreseen_from_the_start_of_the_session_on(without_controls: Ran, series: list[Responses]) -> None:
+    gap, drift = without_controls[0], Calibration.of_series(series).drift
+    assert drift is not None and np.all(np.isfinite(drift.minutes_to(LARGE)))
+    since_min = gap.session.log.header["start_min"] - series[-1].start_min
+    assert gap.outlook.drifted_min == pytest.approx([each - since_min for each in drift.minutes_to(LARGE)])
 
 
 def test_controls_have_no_more_episodes_than_the_policies_but_five_each() -> None:
@@ -358,6 +374,8 @@ def test_a_missing_warm_up_is_reported_for_a_prediction_with_memory(tmp_path: Pa
                 warm_up=warm_up,
             )
         assert ("no-warm-up" in {finding.name for finding in gap.findings}) == is_reported
+        # Pulses of the warm-up are not counted.
+        assert {row.pulses_per_action for row in gap.rows} == {pulses}
 
 
 def test_one_episode_gives_no_interval_of_the_gap(without_controls: Ran) -> None:
@@ -779,6 +797,8 @@ def test_a_recording_much_older_than_the_culture_is_reported(
         gap = run_policies(
             {"p0": policy_of(0, series)}, culture, calibration, tmp_path, episodes=1, with_controls=False
         )
+    # A single policy has one row.
+    assert [row.name for row in gap.rows] == ["p0", "random"]
     found = [finding for finding in gap.findings if finding.name == "old-calibration"]
     assert [finding.value for finding in found] == ([pytest.approx(age_min)] if warned else [])
 

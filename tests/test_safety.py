@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from fractions import Fraction
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -278,6 +279,7 @@ WIDE = replace(SIMULATED_LIMITS, stimuli_per_s=10, stimuli_per_electrode_s=5, st
         ("sites", [one(electrodes=(10, 10))], "each electrode once"),
         ("overlap", [one(), one(time_s=0.0005)], "500 us too early"),
         ("overlap", [one(time_s=math.nan)], "finite times"),
+        ("overlap", [one(time_s=math.inf)], "finite times"),
         ("overlap", [one(time_s=-1e-6)], "from 0 s on, got -1e-06"),
         ("stimuli_per_s", [one(electrodes=(10 + i % 3,), time_s=i * 0.09) for i in range(11)], "at most 10 stimuli"),
         ("stimuli_per_electrode_s", [one(time_s=i * 0.1) for i in range(6)], "at most 5 stimuli on an electrode"),
@@ -324,6 +326,14 @@ def test_an_emergency_stop_refuses_everything_until_a_new_session() -> None:
     Guard(WIDE, SITES, History(), 0.0).admit([one()], 0.0)
 
 
+@pytest.mark.parametrize("now_s", [math.nan, math.inf])
+def test_a_clock_that_fails_admits_nothing(now_s: float) -> None:
+    guard = Guard(WIDE, SITES)
+    with pytest.raises(InvalidArgument, match=f"now_s: expected a finite time on the culture's clock, got {now_s}"):
+        guard.admit([one()], now_s)
+    assert guard.delivered == 0
+
+
 def test_only_a_guard_admits() -> None:
     with pytest.raises(InvalidArgument, match="expected to be made by a Guard"):
         Admitted([one()], 0.0, by=None)
@@ -338,13 +348,15 @@ def test_a_gap_of_more_than_a_second_does_not_keep_the_first_stimulus_waiting() 
     guard.check([Stimulus(0.0, (11,), BALANCED_PULSE)], ends_s + 5)
 
 
-def test_only_what_time_makes_safe_is_waited_for() -> None:
+def test_only_what_time_makes_safe_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
     loud, last = one(Pulse((Phase(100, amplitude_mv=-401),))), one(time_s=0.2)
     for interval_us, earliest_s in ((100_000.0, 0.3), (2_000_000.0, 2.2), (5_000_000.0, None)):
         guard = Guard(replace(WIDE, interval_us=interval_us), SITES)
         guard.admit([last], 0.0)
-        with pytest.raises(UnsafeStimulus, match="amplitude"):
+        with monkeypatch.context() as patched, pytest.raises(UnsafeStimulus, match="amplitude"):
+            patched.setattr(guard, "check", check := Mock(wraps=guard.check))
             guard.earliest([loud], 0.25)
+        assert check.call_count == 1
         if earliest_s is None:
             with pytest.raises(UnsafeStimulus, match="interval_us"):
                 guard.earliest([one()], 0.25)

@@ -716,7 +716,7 @@ def test_a_device_is_open_to_all_users_whatever_the_umask(tmp_path: Path) -> Non
     device = tmp_path / "animat-cl1"
     before = os.umask(0o077)
     try:
-        for holder, is_handed_over in (("a", False), ("a", False), ("b", True)):
+        for holder, is_handed_over in (("first", False), ("first", False), ("b", True), ("b", False)):
             with holding.hold(device, holder) as found:
                 assert found is is_handed_over
     finally:

@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing, nullcontext, suppress
 from dataclasses import asdict, replace
 from datetime import UTC, datetime
@@ -38,6 +38,7 @@ from animat.cultures.observed import more_left_out
 from animat.errors import AnimatError, InvalidArgument, Mismatch, expect_at_least, shown, some_of
 from animat.evaluation.statistics import Interval
 from animat.progress import Progress, Silent
+from animat.stimulation.plain import whole_number
 from animat.writing import UNCHANGED
 
 MOST_EPISODES = 100_000
@@ -94,7 +95,8 @@ def run_session(
         InvalidFile: if the folder is a file, or the log cannot be begun.
         UnsafeStimulus: for a pulse beyond the culture's limits.
     """
-    planned = [episodes] * len(agents) if isinstance(episodes, int) else list(episodes)
+    several = episodes if isinstance(episodes, Iterable) else [episodes] * len(agents)
+    planned, seed = [whole_number("episodes", number) for number in several], whole_number("seed", seed)
     check_session(culture, loop, agents, planned, seed)
     if unknown := sorted({*(predicted or {})} - {agent.name for agent in agents}):
         raise InvalidArgument(f"predicted: expected names of agents, got {', '.join(unknown)}")
@@ -209,7 +211,7 @@ class _Supervisor:
         done: float = sum(map(len, returns.values()))
         note = "warm-up"
         if episode is not None:
-            done += 0 if episode.is_whole else min(1.0, episode.iterations / self._loop.robot.episode_limit)
+            done += 0 if episode.is_whole else episode.iterations / self._loop.robot.episode_limit
             note = f"{episode.agent}: return {episode.total:.1f}{'' if episode.is_whole else ' so far'}"
         if returns:
             note += f"; means: {', '.join(f'{name} {fmean(of):.1f}' for name, of in returns.items())}"

@@ -247,8 +247,7 @@ class _Run:
                 timeline = self._record(number, part)
             except BudgetSpent as spent:
                 self.write("budget", message=str(spent))
-                in_budget = False
-                continue
+                in_budget, timeline = False, None
             if timeline is not None:
                 trainers.publish(number, timeline)
         self._wait(self.timetable.duration_min, trainers, progress)

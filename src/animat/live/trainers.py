@@ -90,8 +90,7 @@ class TrainAlongside(Task):
                 state["using"] = number
                 state["swaps"].append({"swap": number, **swaps[-1]})
                 report(reports, state)
-            if simulator is None:
-                raise AnimatError("live: expected a simulator in the exchange before training began, got none")
+            assert simulator is not None
             state["mean_return"] = together.train(index, simulator)
             if time.monotonic() - saved_s > self.keep_s:
                 save_policies(group, together.policies(), folder)
