@@ -127,14 +127,15 @@ def test_a_folder_that_cannot_be_written_to_is_found_before_a_culture_is_opened(
 
 
 def test_without_room_for_a_recording_nothing_is_stimulated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    # Of 2 MB a minute: two blocks of half a second of set-up, a pause and five pulses, tails included.
+    # Of 1 MB, and 2 MB a minute: two blocks of half a second of set-up, a pause and five pulses, tails included.
     takes_min = 2 * (0.5 + 0.2 + SHORT.tail_s) / 60 + (5 / 20 + 5 / 80) / 60
-    room = iter([3e6 * takes_min, 3e6 * takes_min, 1.9e6 * takes_min])
+    needed = 1e6 + 2e6 * takes_min
+    room = iter([1.01 * needed, 1.01 * needed, 0.99 * needed])
     usage = shutil.disk_usage(tmp_path)
     monkeypatch.setattr("animat.writing.shutil.disk_usage", lambda _: usage._replace(free=next(room)))
     (tmp_path / "notes.txt").touch()
     with FakeCulture() as culture:
-        with pytest.raises(InvalidFile, match=r"expected 0\.\d+ MB free .* MB: make room, or choose another"):
+        with pytest.raises(InvalidFile, match=f"expected {needed / 1e6:.2f} MB free .* MB: make room, or choose"):
             record_series(lambda: culture, SHORT, tmp_path, sessions=2, interval_min=1.0)
         assert culture.pulses == 10
     assert [file.name for file in sorted(tmp_path.glob("*.nwb"))] == ["recording_0000_min.nwb"]
