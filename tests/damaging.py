@@ -51,7 +51,8 @@ def sound(kind: str, path: Path) -> None:
     table = mapping_table([3, 9, 40], [1000, 2000, 26_399])
     stimuli = np.arange(1, 9)
     if kind == "nwb":
-        write_nwb(synthetic_recording(3, patterns=3, channels=16), path)
+        write_nwb(synthetic_recording(3, patterns=3, channels=16), path.with_suffix(".nwb"))
+        path.with_suffix(".nwb").rename(path)
     elif kind == "other-nwb":
         from test_rig_readers import other_nwb
 

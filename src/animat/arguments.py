@@ -18,8 +18,8 @@ Thing = TypeVar("Thing", bound=Callable[..., Any])
 _ONE = {
     "Calibration": "a calibration, as animat.Calibration.of_series returns",
     "Conditions": "conditions, such as 'frequency:5,10'",
-    "Culture": "a culture, such as animat.VirtualCulture(seed=1)",
     "Channels": "a channel table, animat.Channels",
+    "Culture": "a culture, such as animat.VirtualCulture(seed=1)",
     "Environment": "an environment, such as animat.Animat(animat.Cartpole(), animat.Thresholds(9), 9)",
     "Goal": "a goal, such as 'avoid pole_angle outside -12..12 deg'",
     "Mapping": "a mapping, such as animat.Thresholds(9)",
@@ -43,6 +43,7 @@ _ONE = {
     "int": "a whole number",
     "str": "text",
 }
+"""What a kind is called in a message, and where one comes from."""
 _SEVERAL = {
     "str": "a list of names",
     "str by name": "text by name",
@@ -53,6 +54,7 @@ _SEVERAL = {
     "Responses": "a list of responses, as animat.extract_series returns",
     "TrainingCallback": "a list of functions that take a row of a learning curve",
 }
+"""What several of a kind are called."""
 _NUMBERS: dict[Any, Any] = {float: Real, int: Integral}
 _UNSAID = ("ResponseTable", "str")
 """What may also come and goes without saying: a table in place of a recording, text in place of what it names."""

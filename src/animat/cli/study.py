@@ -59,8 +59,9 @@ def _run_one(study: Study, base: Path, command: JobOptions) -> dict[str, Any]:
     messages = not_outperforming(results)
     for message in messages:
         print(message)
-    done = f"{len(ran.done_now)} of {ran.jobs} jobs in {time.monotonic() - began:.0f} s"
-    print(f"{done if ran.done_now else f'nothing to do: all {ran.jobs} jobs are done'}; report: {ran.report}")
+    done, n = f"all {ran.jobs} jobs are done", len(ran.done_now)
+    now = f"{done}, {n} of them now, in {time.monotonic() - began:.0f} s" if n else f"nothing to do: {done}"
+    print(f"{now}; report: {ran.report}")
     return {
         "folder": str(ran.folder),
         "report": str(ran.report),

@@ -90,7 +90,8 @@ class TrainAlongside(Task):
                 state["using"] = number
                 state["swaps"].append({"swap": number, **swaps[-1]})
                 report(reports, state)
-            assert simulator is not None
+            if simulator is None:
+                raise AnimatError("live: expected a simulator in the exchange before training began, got none")
             state["mean_return"] = together.train(index, simulator)
             if time.monotonic() - saved_s > self.keep_s:
                 save_policies(group, together.policies(), folder)
