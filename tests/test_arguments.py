@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import inspect
+import subprocess
+import sys
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -113,3 +115,15 @@ def test_a_recording_made_by_hand_names_what_is_of_the_wrong_kind(changed: Any, 
     with pytest.raises(animat.AnimatError) as raised:
         animat.Recording(**{**given, **changed})
     assert str(raised.value) == message
+
+
+def test_names_in_place_of_a_robot_and_a_mapping_are_refused() -> None:
+    # In a process of its own: here the type checks of the tests come first.
+    for arguments, message in (
+        ("'cartpole', '9-thresholds', 5", "robot: expected a robot, such as animat.Cartpole(), got 'cartpole'"),
+        ("animat.Cartpole(), 'linear', 5", "mapping: expected a mapping, such as animat.Thresholds(9), got 'linear'"),
+    ):
+        ran = subprocess.run(
+            [sys.executable, "-c", f"import animat; animat.Animat({arguments})"], capture_output=True, text=True
+        )
+        assert ran.returncode and ran.stderr.rstrip().endswith(f"InvalidArgument: {message}")

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from animat.coding.decoder import decode, expect_fit, expect_one_command
 from animat.coding.mapping import Mapping
-from animat.errors import InvalidArgument
+from animat.errors import InvalidArgument, expect_kind
 from animat.neurons.history import INITIAL_HISTORY
 from animat.neurons.simulator import Answer, NeuronSimulator
 from animat.robots.base import Quantity, Robot
@@ -151,11 +151,18 @@ class Animat(Environment[RobotState]):
 
     Attributes:
         mapping: from the response of a readout to a motor command.
+
+    Raises:
+        InvalidArgument: for anything but a robot and a mapping, such as their names.
     """
 
     robot: Robot[RobotState]
     mapping: Mapping
     n_conditions: int
+
+    def __post_init__(self) -> None:
+        expect_kind("robot", self.robot, Robot, "a robot, such as animat.Cartpole()")
+        expect_kind("mapping", self.mapping, Mapping, "a mapping, such as animat.Thresholds(9)")
 
     @property
     def n_actions(self) -> int:
