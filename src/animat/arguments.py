@@ -81,12 +81,17 @@ def checked_arguments(thing: Thing) -> Thing:
         except TypeError:
             return function(*args, **kwargs)  # Python says what is missing or too much.
         for name in names:
-            hint = _hints(function).get(name, Any)
-            if name in given and (strangers := _strangers(given[name], hint)):
-                raise InvalidArgument(f"{name}: expected {_words(hint)}, got {shown(strangers[0])}")
+            if name in given:
+                check_argument(name, given[name], _hints(function).get(name, Any))
         return function(*args, **kwargs)
 
     return cast(Thing, checked)
+
+
+def check_argument(name: str, value: Any, hint: Any) -> None:
+    """Raise InvalidArgument for a single argument that is not of a kind; for where the decorator cannot stand."""
+    if strangers := _strangers(value, hint):
+        raise InvalidArgument(f"{name}: expected {_words(hint)}, got {shown(strangers[0])}")
 
 
 @functools.cache

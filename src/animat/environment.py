@@ -11,9 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
+from animat.arguments import check_argument
 from animat.coding.decoder import decode, expect_fit, expect_one_command
 from animat.coding.mapping import Mapping
-from animat.errors import InvalidArgument, expect_kind
+from animat.errors import InvalidArgument
 from animat.neurons.history import INITIAL_HISTORY
 from animat.neurons.simulator import Answer, NeuronSimulator
 from animat.robots.base import Quantity, Robot
@@ -161,8 +162,9 @@ class Animat(Environment[RobotState]):
     n_conditions: int
 
     def __post_init__(self) -> None:
-        expect_kind("robot", self.robot, Robot, "a robot, such as animat.Cartpole()")
-        expect_kind("mapping", self.mapping, Mapping, "a mapping, such as animat.Thresholds(9)")
+        # Not by the decorator: what checks types in the tests would read these annotations as those of its file.
+        check_argument("robot", self.robot, Robot)
+        check_argument("mapping", self.mapping, Mapping)
 
     @property
     def n_actions(self) -> int:

@@ -243,7 +243,8 @@ def _parse(arguments: list[str]) -> Command:
         if message.startswith("Missing from "):
             message = f"{message.partition(': ')[2].split()[0]}: expected a value, got none"
         if message.startswith("Missing value for argument '"):
-            message = f"{message.split(chr(39))[1]}: expected two numbers, got one"
+            _, option, _ = message.split("'")
+            message = f"{option}: expected two numbers, got one"
         if message.startswith("{") or message.partition(":")[0].isupper():
             # The choices or the kind of a positional argument, in place of its name.
             named = next(field.name for field in fields if "Positional" in str(field.type))

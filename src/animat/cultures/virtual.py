@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 from jaxtyping import Int64
 
-from animat.arguments import checked_arguments
+from animat.arguments import check_argument, checked_arguments
 from animat.cultures.base import ComputedCulture
 from animat.cultures.failures import once_opened
 from animat.cultures.observed import Observed, Spikes
 from animat.cultures.safety import Admitted, Limits
 from animat.cultures.visibility import Visibility
-from animat.errors import InvalidArgument, Mismatch, expect_at_least, expect_kind
+from animat.errors import InvalidArgument, Mismatch, expect_at_least
 from animat.plain_file import expect_plain_file
 from animat.progress import Progress, Silent
 from animat.recordings.recorded_culture import RecordedCulture
@@ -74,7 +74,7 @@ class VirtualCulture(ComputedCulture):
     ) -> None:
         super().__init__(limits)
         expect_at_least("seed", seed := whole_number("seed", seed), 0)
-        expect_kind("selection", selection, Selection | None, "a selection, as animat.Selection.load returns")
+        check_argument("selection", selection, Selection | None)
         if not 0 < number("scan_s", scan_s) <= 3600:
             raise InvalidArgument(f"scan_s: expected above 0 to 3600 s, got {scan_s}")
         self.seed = seed

@@ -360,6 +360,7 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray[Any, Any]], dict[str, Any]]:
     return arrays, description
 
 
+@checked_arguments
 def first_of_alike(policies: Dict[str, Policy], attributes: Sequence[str], advice: str) -> Policy:
     """The first of several policies, which represents all of them.
 
