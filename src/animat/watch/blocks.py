@@ -68,7 +68,7 @@ def _cell(value: Any, most: int = 300) -> Any:
 
 
 def time_left(seconds: float | None, state: dict[str, Any]) -> str:
-    """The remaining time of work in a state (`animat.watch.state.state_of`)."""
+    """The remaining time of work in a state (`animat.watch.discovery.state_of`)."""
     if state["state"] != "running":
         return "none: it has ended" if state["state"] == "ended" else "none: it is not running"
     return "not known yet" if (known := number(seconds)) is None else format_duration(known)
