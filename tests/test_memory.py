@@ -23,9 +23,8 @@ from animat.coding.mapping import Linear, Thresholds
 from animat.environment import Animat, WithoutNeurons
 from animat.errors import InvalidArgument, InvalidFile, Mismatch, UnusableData
 from animat.evaluation.commands import CLASSES, commands_after
-from animat.evaluation.heuristic import heuristic_policy
 from animat.evaluation.optimum import best_return, best_returns
-from animat.evaluation.rollouts import Constant, Uniform, networks_of, roll_out
+from animat.evaluation.rollouts import Constant, Uniform, heuristic_policy, networks_of, roll_out
 from animat.execution.training import train
 from animat.neurons.fidelity import fidelity
 from animat.neurons.kinds import Kind
@@ -39,8 +38,7 @@ from animat.recordings.recorded_culture import RecordedCulture
 from animat.responses.condition import Condition
 from animat.responses.conditions import conditions_named
 from animat.responses.extraction import extract_responses
-from animat.responses.quality.memory import memory_findings
-from animat.responses.quality.within_conditions import compare_passing
+from animat.responses.quality.history import compare_passing, memory_findings
 from animat.responses.responses import Responses, Trials
 from animat.robots.cartpole import Cartpole
 from animat.robots.navigation import Navigation

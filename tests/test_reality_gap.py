@@ -30,9 +30,8 @@ from animat.environment import Animat
 from animat.errors import InvalidArgument, Mismatch
 from animat.evaluation.controls import Control
 from animat.evaluation.coupling import Coupling
-from animat.evaluation.heuristic import HeuristicPolicy, heuristic_policy
 from animat.evaluation.optimum import best_return
-from animat.evaluation.rollouts import Uniform, networks_of, roll_out
+from animat.evaluation.rollouts import HeuristicPolicy, Uniform, heuristic_policy, networks_of, roll_out
 from animat.evaluation.table import evaluate
 from animat.evaluation.verdict import EpisodeComparison
 from animat.neurons.history_tracker import HistoryState

@@ -32,7 +32,7 @@ from animat.cultures.kinds import recorded_culture
 from animat.cultures.virtual import VirtualCulture
 from animat.environment import Animat
 from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch, UnusableData
-from animat.evaluation.heuristic import heuristic_policy
+from animat.evaluation.rollouts import heuristic_policy
 from animat.execution.jobs import in_order
 from animat.execution.receipts import Receipt, digest_of
 from animat.execution.task import carry_out

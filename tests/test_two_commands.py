@@ -27,10 +27,10 @@ from animat.closed_loop.session import read_session
 from animat.coding.mapping import Thresholds
 from animat.environment import Animat, WithoutNeurons
 from animat.errors import InvalidArgument, InvalidFile, Mismatch
-from animat.evaluation.heuristic import HeuristicPolicy
+from animat.evaluation.rollouts import HeuristicPolicy
 from animat.evaluation.table import evaluate
 from animat.execution.training import train
-from animat.neurons.adjusted_rank import AdjustedRanks
+from animat.neurons.history_tracker import AdjustedRanks
 from animat.neurons.simulator import fit_empirical
 from animat.neurons.timeline import SimulatorTimeline, fit_timeline
 from animat.reality_gap import Calibration, run_policies

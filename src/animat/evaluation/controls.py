@@ -12,8 +12,7 @@ import numpy as np
 from animat.environment import Animat, Environment
 from animat.evaluation.commands import mean_commands
 from animat.evaluation.coupling import best_coupling
-from animat.evaluation.heuristic import heuristic_policy
-from animat.evaluation.rollouts import Actor, Constant, Episodes, Networks, Uniform, roll_out
+from animat.evaluation.rollouts import Actor, Constant, Episodes, Networks, Uniform, heuristic_policy, roll_out
 from animat.neurons.simulator import NeuronSimulator, indifferent, silenced
 from animat.robots.host import HostRobot
 from animat.wrappers import (

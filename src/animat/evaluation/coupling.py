@@ -17,11 +17,9 @@ from scipy.stats import t as student_t
 from animat.environment import Environment
 from animat.errors import InvalidArgument
 from animat.evaluation.commands import mean_commands
-from animat.evaluation.heuristic import heuristic_policy
 from animat.evaluation.optimum import Optimum
-from animat.evaluation.rollouts import Actor, Seen, Uniforms, nearest_action, roll_out
+from animat.evaluation.rollouts import Actor, Seen, Uniforms, heuristic_policy, nearest_action, roll_out, trace
 from animat.evaluation.statistics import CONFIDENCE, Interval, standard_error
-from animat.evaluation.traces import trace
 from animat.neurons.simulator import NeuronSimulator
 from animat.progress import Progress
 from animat.robots.base import capability

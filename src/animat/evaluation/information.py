@@ -13,9 +13,8 @@ from jaxtyping import Array, Float64, Int
 
 from animat.environment import Environment
 from animat.errors import InvalidArgument
-from animat.evaluation.rollouts import Actor
+from animat.evaluation.rollouts import Actor, trace
 from animat.evaluation.statistics import CONFIDENCE, Interval
-from animat.evaluation.traces import trace
 from animat.neurons.simulator import NeuronSimulator
 from animat.robots.base import capability
 

@@ -13,9 +13,8 @@ from animat.environment import Animat, Environment
 from animat.errors import InvalidArgument
 from animat.evaluation.controls import Control, interventions_of
 from animat.evaluation.information import DRAWS, GoalInformation, goal_information, interval_of_mean
-from animat.evaluation.rollouts import Networks
+from animat.evaluation.rollouts import Networks, Traces, trace
 from animat.evaluation.statistics import Interval
-from animat.evaluation.traces import Traces, trace
 from animat.neurons.simulator import NeuronSimulator
 from animat.progress import Progress, Silent
 from animat.records import as_json

@@ -6,21 +6,22 @@ import abc
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, final
+from typing import Any, NamedTuple, final
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Float64, Int, Int64, Key, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Float64, Int, Int64, Key, PRNGKeyArray, Shaped
 
 from animat.compilation import COMPILER_OPTIONS
-from animat.environment import Environment
+from animat.environment import Environment, State
 from animat.errors import InvalidArgument, expect_at_least, shown
+from animat.evaluation.commands import mean_commands
 from animat.evaluation.host_rollouts import roll_out_on_host
 from animat.goals.robot import RobotWithGoal
 from animat.goals.tally import Outcome
 from animat.neurons.simulator import NeuronSimulator, stacked
-from animat.robots.base import MOST_AT_ONCE
+from animat.robots.base import MOST_AT_ONCE, capability
 from animat.robots.host import HostRobot
 from animat.tables import briefly
 from animat.training.networks import Layer, Network, as_commands, draw_action, likeliest_action
@@ -101,6 +102,40 @@ def nearest_action(
     apart = means - wanted[:, None]
     distance = jnp.abs(apart) if apart.ndim == 2 else jnp.linalg.norm(apart, axis=2)
     return actions[jnp.argmin(distance, axis=1)]
+
+
+@final
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class HeuristicPolicy(Actor):
+    """The action whose mean command is nearest to that of the robot's `heuristic`, which sees only the robot.
+
+    Attributes:
+        actions: the environment's input for each action, shape (1, actions), for one actor; None where any command can
+            be given (without neurons, continuous ones).
+        means: the mean command of each action, the same shape, or (1, actions, commands) for several commands.
+    """
+
+    actions: Array | None = None
+    means: Float[Array, "..."] | None = None
+
+    def act(self, environment: Environment[Any], observation: Seen, uniforms: Uniforms) -> Array:
+        of_robot = (observation * environment.scales)[:, : len(environment.robot.observation_spec)]
+        wanted: Array = jax.vmap(capability(environment.robot, "heuristic"))(of_robot)
+        return nearest_action(self.actions, self.means, wanted)
+
+
+def heuristic_policy(environment: Environment[Any], simulator: NeuronSimulator | None) -> HeuristicPolicy:
+    """The heuristic policy for an environment and the neurons in it, as one actor for `roll_out`.
+
+    Raises:
+        InvalidArgument: for a robot without a `heuristic`.
+    """
+    capability(environment.robot, "heuristic")
+    if environment.n_actions is None:
+        return HeuristicPolicy()
+    actions, means = mean_commands(environment, simulator)
+    return HeuristicPolicy(jnp.asarray(actions)[None], jnp.asarray(means, jnp.float32)[None])
 
 
 @dataclass(frozen=True, eq=False)
@@ -250,3 +285,61 @@ def _roll_out(
     robot = environment.robot
     outcome = jax.vmap(jax.vmap(robot.outcome))(last.robot) if isinstance(robot, RobotWithGoal) else None
     return *counted, outcome
+
+
+class Traces(NamedTuple):
+    """Episodes of several actors; entries after the end of an episode are meaningless.
+
+    Attributes:
+        states: before each iteration and after the last (`State.carried`), each array with the axes of `observations`.
+        observations: of these states.
+        actions: chosen in each iteration.
+        commands: u of each iteration.
+        lengths: iterations of each episode.
+    """
+
+    states: State
+    observations: Float[np.ndarray, "actors episodes iterations+1 observations"]
+    actions: Shaped[np.ndarray, "actors episodes iterations *commands"]
+    commands: Float[np.ndarray, "actors episodes iterations *commands"]
+    lengths: Int[np.ndarray, "actors episodes"]
+
+
+def trace(
+    environment: Environment[Any],
+    simulator: NeuronSimulator | None,
+    actors: Actor,
+    *,
+    episodes: int,
+    seed: int,
+) -> Traces:
+    """Run episodes of each actor on a robot in JAX; arguments as in `animat.evaluation.rollouts.roll_out`."""
+    n_actors = actors.n_actors
+    keys = jax.random.split(jax.random.key(seed), n_actors * episodes).reshape(n_actors, episodes)
+    traced: Traces = jax.device_get(_trace(environment, simulator, actors, keys))
+    return traced
+
+
+@partial(jax.jit, static_argnums=0)
+def _trace(environment: Environment[Any], simulator: NeuronSimulator | None, actors: Actor, keys: Any) -> Traces:
+    n_drawn = environment.n_drawn
+
+    def one_episode(actor: Actor, key: Any) -> Traces:
+        def iteration(carry: Any, key: Any) -> Any:
+            state, going = carry
+            uniforms = jax.random.uniform(key, (n_drawn + environment.noise_size,))
+            observation = environment.observe(state) / environment.scales
+            action = actor.act(environment, observation[None], uniforms[None, :n_drawn])[0]
+            after = environment.advance(uniforms[n_drawn:], state, action, simulator)
+            still = going & ~jnp.logical_or(*after.ended)
+            return (after.carried, still), (after.carried, action, after.info["command"], going)
+
+        start, key = jax.random.split(key)
+        first = environment.reset(start).carried
+        keys = jax.random.split(key, environment.robot.episode_limit)
+        _, (after, actions, commands, going) = jax.lax.scan(iteration, (first, jnp.bool_(True)), keys)
+        states = jax.tree.map(lambda one, more: jnp.concatenate([one[None], more]), first, after)
+        observations: Any = jax.vmap(environment.observe)(states)
+        return Traces(states, observations, actions, commands, going.sum())
+
+    return jax.vmap(lambda actor, of_actor: jax.vmap(partial(one_episode, actor))(of_actor))(actors, keys)

@@ -11,8 +11,7 @@ from jaxtyping import Float64
 
 from animat.arguments import checked_arguments
 from animat.coding.mapping import Thresholds
-from animat.neurons.adjusted_rank import AdjustedRanks
-from animat.neurons.history_tracker import HistoryTracker
+from animat.neurons.history_tracker import AdjustedRanks, HistoryTracker
 from animat.neurons.kinds import Kind, fit_simulator
 from animat.neurons.memory import MemorySimulator
 from animat.neurons.simulator import NeuronSimulator
@@ -21,7 +20,7 @@ from animat.reality_gap.rereading import reread
 from animat.recordings.findings import Finding
 from animat.recordings.recorded_culture import RecordedCulture
 from animat.responses.condition import Condition
-from animat.responses.median_drift import MedianDrift, median_drift
+from animat.responses.quality.drift import MedianDrift, median_drift
 from animat.responses.readouts import ALL, Readouts
 from animat.responses.responses import Responses
 from animat.stimulation.protocol import Presentation

@@ -7,9 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from animat.closed_loop.adaptive import AdaptiveThresholds, kept_counts
-from animat.neurons.adjusted_rank import AdjustedRanks
 from animat.neurons.history import Ranked
-from animat.neurons.history_tracker import HistoryState
+from animat.neurons.history_tracker import AdjustedRanks, HistoryState
 from animat.responses.responses import Responses
 
 

@@ -11,8 +11,7 @@ from jaxtyping import Float, Int64
 
 from animat.environment import Environment
 from animat.evaluation.host_rollouts import paths_on_host
-from animat.evaluation.rollouts import Actor
-from animat.evaluation.traces import trace
+from animat.evaluation.rollouts import Actor, trace
 from animat.neurons.simulator import NeuronSimulator
 from animat.robots.host import HostRobot
 

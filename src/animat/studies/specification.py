@@ -101,7 +101,7 @@ class RobotSpec:
         iterations: of training, for each policy; None: the paper's.
         parameters: that replace its defaults, such as `pole_mass_kg`.
         optimum_resolution: of its optimal return; replaces the study's.
-        goal: that replaces its own task (`animat.goals.text`); None: its own task.
+        goal: that replaces its own task (`animat.goals.goal`); None: its own task.
         lessons: taught to its policies in turn, each a table `[[robots.lessons]]` (`animat.training.lessons`).
     """
 

@@ -24,11 +24,10 @@ from animat.progress import Progress
 from animat.responses.readouts import ALL
 from animat.robots.host import HostRobot
 from animat.training.course import Course
-from animat.training.diagnosis import Diagnosis, diagnosis_program
 from animat.training.host import OnHost
 from animat.training.networks import Network
 from animat.training.policy import CURVE, Policy
-from animat.training.sac import begin, train_chunk
+from animat.training.sac import Diagnosis, begin, diagnosis_program, train_chunk
 from animat.training.settings import SAC
 from animat.training.specification import CHUNKS, Training
 from animat.wrappers import EpisodeLimit

@@ -42,7 +42,7 @@ HIDDEN_ACTIVATION = "relu"
 """Activation of both hidden layers, max(0, x); stored in every file for users without this package."""
 CURVE = ("iterations", "episodes", "mean_return", "entropy", "alpha", "critic_loss")
 """The columns of a learning curve, one row per chunk: iterations done at its end, the episodes that ended in it, their
-mean return, and the learner's diagnosis at its end (`animat.training.diagnosis`); NaN: unknown."""
+mean return, and the learner's diagnosis at its end (`animat.training.sac`); NaN: unknown."""
 _LAYERS = 3
 _ARRAYS = ("scales", "learning_curve", *(f"layer{i}.{part}" for i in range(_LAYERS) for part in ("weight", "bias")))
 _MOST_BYTES = 2**28
