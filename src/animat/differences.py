@@ -26,13 +26,10 @@ _NOTHING = _Nothing()
 def first_difference(
     found: Any, wanted: Any, name: str = "", *, ignoring: Collection[str] = (), first: Collection[str] = ()
 ) -> str:
-    """The first difference between two pieces of plain data, such as `training.seed: 1 there, 2 now`; empty if none.
+    """The first difference between data in a folder and those requested: `training.seed: 1 there, 2 now`; else empty.
 
-    Args:
-        found: the data in the folder.
-        wanted: the data requested now.
-        name: of both, for the beginning of the message.
-        ignoring, first: keys that do not matter, and keys that come first, at any depth.
+    `name` is that of both, for the beginning of the message; `ignoring` and `first` are keys that do not matter, and
+    keys that come first, at any depth.
     """
     if isinstance(found, dict) and isinstance(wanted, dict):
         pairs = [

@@ -150,9 +150,6 @@ class Environment(abc.ABC, Generic[RobotState]):
 class Animat(Environment[RobotState]):
     """A robot moved by the responses of neurons to the conditions that the agent picks.
 
-    Attributes:
-        mapping: from the response of a readout to a motor command.
-
     Raises:
         InvalidArgument: for anything but a robot and a mapping, such as their names.
     """

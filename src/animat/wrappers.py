@@ -130,11 +130,7 @@ class NeuralObservation(NeuralWrapper[RobotState]):
 class TrialCosts(NeuralWrapper[RobotState]):
     """Adds up the cost of an episode's trials in `State.info["cost"]`; rewards are unchanged (see `net_reward`).
 
-    Attributes:
-        costs: of a trial of each condition, in the units of the reward.
-
-    Raises:
-        InvalidArgument: unless there is one cost per condition.
+    `costs` are those of a trial of each condition, in the units of the reward.
     """
 
     costs: tuple[float, ...]
@@ -177,10 +173,7 @@ class YokedDelivery(NeuralWrapper[RobotState]):
     """Delivers the stimuli chosen for another episode, which runs in parallel: as many, but unrelated to this one.
 
     The agent observes and acts in the other episode, with its own neurons; when it ends it starts again. The same
-    stimuli are delivered here, whatever happens here.
-
-    Raises:
-        InvalidArgument: with a robot that is stepped outside JAX.
+    stimuli are delivered here, whatever happens here. Refuses a robot that is stepped outside JAX.
 
     Source: the non-contingent control of Bakkum et al. 2008, doi:10.1088/1741-2560/5/3/004.
     """
@@ -211,14 +204,7 @@ class YokedDelivery(NeuralWrapper[RobotState]):
 @final
 @dataclass(frozen=True)
 class GoalSwitch(Wrapper[RobotState]):
-    """Gives the robot another goal in mid-episode, that of the first other start whose goal looks different.
-
-    Attributes:
-        at: the number of iterations before the switch.
-
-    Raises:
-        InvalidArgument: for a robot whose goal cannot be switched (`Robot.with_goal_of`).
-    """
+    """Gives the robot another goal after `at` iterations, that of the first other start whose goal looks different."""
 
     at: int
 

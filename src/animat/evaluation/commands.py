@@ -78,10 +78,7 @@ def commands_of(environment: Environment[Any], simulator: NeuronSimulator | None
 
     For thresholds the probabilities are exact: where a condition's distribution passes each threshold is found by
     bisection, to the last bit of a float32. For a continuous mapping 2048 responses of equal probability represent a
-    condition; 21 evenly spaced commands represent a continuous action.
-
-    Raises:
-        InvalidArgument: for an Animat without a simulator.
+    condition; 21 evenly spaced commands represent a continuous action. An Animat needs a simulator (InvalidArgument).
     """
     animat = unwrapped(environment)
     if not isinstance(animat, Animat):

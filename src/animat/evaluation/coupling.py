@@ -56,7 +56,6 @@ class Coupling(Actor):
         weights: W, with b as its last column.
         actions: the environment's input for each action; None where any command can be given.
         means: the mean command of each action.
-        kind: which of the two above.
         seen: indices of the observation that it sees.
     """
 
@@ -84,15 +83,8 @@ def best_coupling(
 
     Differential evolution, twice for each kind, over weights from -12 to 12: once from random weights only, and once
     also with couplings closest to the robot's heuristic, if it has one. All couplings of a search have the same starts
-    and random numbers. The best of the last generations is chosen in fresh episodes.
-
-    Args:
-        simulator: None without neurons.
-        seed: decides every random draw.
-        progress: what to report to.
-
-    Raises:
-        InvalidArgument: for a robot that is stepped outside JAX: the search takes thousands of episodes.
+    and random numbers. The best of the last generations is chosen in fresh episodes. Refuses a robot that is stepped
+    outside JAX (InvalidArgument).
 
     Source: Storn & Price 1997, doi:10.1023/A:1008202821328.
     """

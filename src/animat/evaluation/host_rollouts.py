@@ -74,11 +74,7 @@ def paths_on_host(
     keys: Key[Array, " actors"],
     seed: int,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """One episode of each actor with its path; arguments as in `roll_out_on_host`.
-
-    Returns:
-        Observations before each iteration and after the last, commands, lengths, as in `animat.studies.paths.Paths`.
-    """
+    """One episode of each actor: observations, commands and lengths, as in `animat.studies.paths.Paths`."""
     robot, n = environment.robot, len(keys)
     assert isinstance(robot, HostRobot)
     observations = np.zeros((n, robot.episode_limit + 1, len(robot.observation_spec)), np.float32)

@@ -62,12 +62,8 @@ def goal_information(
 
     with s a state of each episode at a random iteration, and g the goals of the other episodes, each substituted for
     the state's own: sensors and all else stay the same. So goals do not depend on s, as they would if an actor had
-    been moving towards its own goal.
-
-    Args:
-        actors: one kind of actor, its arrays with a leading axis of actors.
-        draws: actions drawn at each state with each goal; 2 are enough for deterministic actors.
-        seed: decides every random draw.
+    been moving towards its own goal. `draws` are the actions drawn at each state with each goal; 2 are enough for
+    deterministic actors.
 
     Raises:
         InvalidArgument: for continuous actions, or a robot whose goal cannot be switched (`Robot.with_goal_of`).

@@ -84,13 +84,7 @@ class WellSampled:
         39 times, and e the grid's error. The lower end is the lower of those of the percentile and the reversed
         interval, as an optimum is the best of several values and few responses raise it. If conditions do not differ
         significantly (Kruskal-Wallis, p > 0.05), it reaches down to the return of random stimuli. Neither end is
-        outside the range of possible returns.
-
-        Args:
-            resolution: of the optimum's grid; the coarse one is not finer.
-            resamples: number of bootstrap samples; 0: no interval.
-            seed: decides every random draw.
-            progress: what to report to.
+        outside the range of possible returns. `resolution` is that of the optimum's grid; the coarse one is not finer.
         """
         from scipy.stats import kruskal
 
@@ -118,10 +112,8 @@ def with_enough_samples(responses: Responses) -> tuple[Responses, tuple[str, ...
     """Responses to the conditions with 30 or more non-burst responses, and the other conditions, with their number.
 
     The best of several values is likely a lucky one, so a condition with three responses promises too much. With 30 or
-    more, nine of ten intervals contain the true optimum, with 10 four of five (docs/evidence/optimal-return.md).
-
-    Raises:
-        UnusableData: if no condition has that many.
+    more, nine of ten intervals contain the true optimum, with 10 four of five (docs/evidence/optimal-return.md). Raises
+    UnusableData if no condition has that many.
     """
     n, few = _counts(responses), undersampled(responses)
     if len(few) == len(n):

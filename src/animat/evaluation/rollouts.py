@@ -126,11 +126,7 @@ class HeuristicPolicy(Actor):
 
 
 def heuristic_policy(environment: Environment[Any], simulator: NeuronSimulator | None) -> HeuristicPolicy:
-    """The heuristic policy for an environment and the neurons in it, as one actor for `roll_out`.
-
-    Raises:
-        InvalidArgument: for a robot without a `heuristic`.
-    """
+    """The heuristic policy for an environment, as one actor; InvalidArgument for a robot without a `heuristic`."""
     capability(environment.robot, "heuristic")
     if environment.n_actions is None:
         return HeuristicPolicy()
@@ -183,11 +179,7 @@ def check_at_once(name: str, episodes: int, n_actors: int) -> None:
 
 
 def networks_of(policies: Sequence[Policy], *, greedy: bool = False) -> Networks:
-    """Stack the networks of policies that share one shape.
-
-    Raises:
-        InvalidArgument: if there are none, or their shapes differ.
-    """
+    """Stack the networks of policies; raises InvalidArgument if there are none, or their shapes differ."""
     if not policies:
         raise InvalidArgument("policies: expected at least one, got none")
     if len({tuple(w.shape for w in policy.weights) for policy in policies}) > 1:
@@ -211,9 +203,7 @@ def roll_out(
     """Run episodes of several actors on one simulator.
 
     Args:
-        simulator: None without neurons.
         actors: one kind of actor, its arrays with a leading axis of actors.
-        episodes: of each actor.
         seed: decides every random draw, together with an actor's place.
         alike: whether all actors get the same random numbers, so that only their actions differ.
 
@@ -292,10 +282,6 @@ class Traces(NamedTuple):
 
     Attributes:
         states: before each iteration and after the last (`State.carried`), each array with the axes of `observations`.
-        observations: of these states.
-        actions: chosen in each iteration.
-        commands: u of each iteration.
-        lengths: iterations of each episode.
     """
 
     states: State

@@ -116,8 +116,7 @@ def p_of_u(u: float, n_first: int, n_second: int) -> float:
         z = (|U - m| - 1/2) / s,    m = n_1 n_2 / 2,    s^2 = n_1 n_2 (n_1 + n_2 + 1) / 12,
         p = min(1, 2 (1 - Phi(z)))
 
-    Raises:
-        InvalidArgument: for an empty group, or a U that is impossible for groups of these sizes.
+    Refuses an empty group, and a U that is impossible for groups of these sizes (InvalidArgument).
     """
     from scipy.stats import norm
 
@@ -167,11 +166,7 @@ def holm(p: Mapping[str, float]) -> dict[str, float]:
 
         p'_(i) = min(1, max_(j <= i) (m - j + 1) p_(j)),    p_(1) <= ... <= p_(m)
 
-    Args:
-        p: of each comparison, by name.
-
-    Raises:
-        InvalidArgument: for a p outside 0 to 1.
+    `p` is that of each comparison, by name; one outside 0 to 1 raises InvalidArgument.
 
     Source: Holm 1979, Scandinavian Journal of Statistics 6, 65-70.
     """

@@ -47,9 +47,6 @@ class Objective:
         weight: relative to the other objectives; only the ratios of weights matter.
         within: for `"drive"`: more consecutive iterations outside than this, the start included, end an episode as
             failed; None: they do not.
-
-    Raises:
-        InvalidArgument: naming what was expected and what was given.
     """
 
     kind: Kind
@@ -87,11 +84,7 @@ class Goal:
 
 
 def read_goal(text: Any) -> Goal:
-    """Parse a goal; `str` is the inverse.
-
-    Raises:
-        InvalidArgument: naming the objective, what was expected and what was given.
-    """
+    """Parse a goal; `str` is the inverse. InvalidArgument names the objective that cannot be read."""
     if not isinstance(text, str):
         raise InvalidArgument(f"goal: expected a string such as {_EXAMPLE!r}, got {shown(text)}")
     clauses = [clause.strip() for clause in re.split("[;\n]", text) if clause.strip()]

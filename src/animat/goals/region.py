@@ -32,9 +32,6 @@ class Range:
         low, high: its ends; None: there is none.
         unit: of the ends; empty for a quantity without a unit.
         outside: whether it is the range outside the two ends.
-
-    Raises:
-        InvalidArgument: for no ends, or ends with nothing between them.
     """
 
     quantity: Name

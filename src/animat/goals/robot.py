@@ -270,7 +270,6 @@ def with_goal(robot: Robot[Any] | str, goal: Goal | str) -> RobotWithGoal:
     """A robot with a goal in place of its own task.
 
     Args:
-        robot: a robot or its name.
         goal: a goal or its text, `"avoid pole_angle outside -12..12 deg"` (`animat.goals.goal`).
 
     Raises:

@@ -62,8 +62,7 @@ class Halves(NamedTuple):
 def halved(responses: Responses, readout: int | None = None) -> Halves:
     """Split a recording's responses in the middle: by time, or within each condition if presented in blocks.
 
-    Raises:
-        UnusableData: for a single condition, or a half with fewer than `FEWEST` non-burst responses to a condition.
+    Raises UnusableData for one condition, or a half with fewer than `FEWEST` non-burst responses to a condition.
     """
     labels = [condition.label for condition in responses.conditions]
     if len(labels) < 2:
@@ -217,10 +216,8 @@ def free_runs(
     """Draw n series of responses from a simulator in place of the held-out half.
 
     Conditions and times are the recorded ones. A simulator with memory remembers its own answers; for trials that it
-    does not answer (bursts, trials without a condition or in the first half) the recorded history is used.
-
-    Returns:
-        Responses in Hz at the places of the recorded ones, NaN elsewhere.
+    does not answer (bursts, trials without a condition or in the first half) the recorded history is used. Responses
+    are at the places of the recorded ones; elsewhere is NaN.
     """
     halves = prediction.halves
     presented, place = halves.whole.presentations

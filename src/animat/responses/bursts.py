@@ -75,9 +75,8 @@ def separate_bursts(
     valley of at least 0.8 between them, or of 0.5 if they are 8 standard deviations apart. Otherwise no response is a
     burst.
 
-    Args:
-        active_ratio: the share of the `n_channels` with at least one spike in the window, shape (responses,).
-        threshold: a ratio from 0 to 1 to use in any case; 1 keeps every response.
+    `active_ratio` is the share of the `n_channels` with at least one spike in the window. A given `threshold`, from
+    0 to 1, is used in any case; 1 keeps every response.
 
     Source: the paper's burst separation (Otsu's threshold over all ratios of a recording), which always cuts.
     """

@@ -44,20 +44,14 @@ def draw_robot(
     earlier: Sequence[Float[np.ndarray, " observations"]] = (),
     height_px: int = 360,
 ) -> Picture:
-    """A picture of a robot as an observation describes it.
+    """A picture of a robot as an observation, in its own units, describes it: red, green and blue from 0 to 255.
 
     Args:
-        robot: one with a method `draw`.
-        observation: in the robot's own units.
         command: the motor command u in [-1, 1] that led to it; for several commands, an array or one value for all.
         earlier: the earlier observations of the episode.
-        height_px: height of the picture; its width follows.
-
-    Returns:
-        red, green, blue from 0 to 255.
 
     Raises:
-        InvalidArgument: for a robot without such a method, or if it raises or does not return a picture.
+        InvalidArgument: for a robot without a method `draw`, or if it raises or does not return a picture.
     """
     if robot.n_commands > 1:
         command = np.broadcast_to(command, robot.n_commands)
@@ -93,14 +87,9 @@ def draw_over_time(
     success: str,
     ylabel: str,
 ) -> None:
-    """Draw one number of each episode over time, coloured by how the episode ended.
+    """Draw one number of each episode over time, coloured by how the episode ended, with horizontal lines at `limits`.
 
-    Args:
-        robot: one whose iterations last `step_s`.
-        values: for each episode, one number per iteration.
-        limits: drawn as horizontal lines.
-        success: what the episodes that ended well did: `end upright`.
-        ylabel: the number's name and unit.
+    `success` says what the episodes that ended well did: `end upright`.
     """
     for course, is_good in zip(values, ended_well, strict=True):
         time_s = np.arange(len(course)) * robot.step_s

@@ -29,9 +29,6 @@ class Axis:
         low, high: its ends; a state beyond them has the value of the end.
         nodes: number of values, at least 4, including both ends (for a periodic axis, only the lower one).
         periodic: whether `high` is the same as `low`.
-
-    Raises:
-        InvalidArgument: for ends that do not rise, or fewer than four nodes.
     """
 
     name: str

@@ -53,10 +53,6 @@ class GymnasiumRobot(HostRobot):
         low, high: for each dimension of a Box; empty for a Discrete.
         levels: n of a Discrete(n); 0: a Box.
         scales: of each number of the flattened observation.
-        keeps_state: as in `HostRobot`.
-
-    Raises:
-        InvalidArgument: for parameters that no environment has.
     """
 
     id: str
@@ -157,9 +153,8 @@ class GymnasiumRobot(HostRobot):
         """The environment with this id, which is made, inspected, and moved at random for some steps.
 
         Args:
-            id: as for `gymnasium.make`.
+            id, settings: as for `gymnasium.make`.
             episode_limit: iterations after which an episode is cut off; None: the registered limit.
-            settings: arguments of `gymnasium.make`.
 
         Raises:
             InvalidArgument: if it does not exist or is not installed, has unsupported spaces, or has no limit.

@@ -35,12 +35,7 @@ class Body(abc.ABC):
 
     @abc.abstractmethod
     def step(self, action: Any) -> tuple[Float[np.ndarray, " observations"], float, bool, bool]:
-        """One iteration by one of the robot's `actions`.
-
-        Returns:
-            the observation, the reward in the task's own units, whether the task itself ended, and whether it was cut
-            off.
-        """
+        """One iteration by one of the robot's `actions`: observation, reward, whether the task ended or was cut off."""
 
     def picture(self) -> UInt8[np.ndarray, "height width 3"] | None:
         """The body as it is now; None if it has no picture."""
@@ -138,11 +133,7 @@ class Snapshot(NamedTuple):
 
 
 class Bodies:
-    """Bodies of one robot side by side, each with its own sequence of episodes.
-
-    Args:
-        seeds: of each body; the seed of an episode follows from it and the episode's number.
-    """
+    """Bodies of one robot side by side; the seeds of its episodes follow from a body's seed and their numbers."""
 
     def __init__(self, robot: HostRobot, seeds: Sequence[Sequence[int]], *, with_pictures: bool = False) -> None:
         self.robot, self._seeds = robot, [tuple(seed) for seed in seeds]
@@ -178,8 +169,7 @@ class Bodies:
     def step(self, commands: Float[np.ndarray, "bodies commands"]) -> StepResult:
         """One iteration of each body; ended episodes wait for `begin`.
 
-        Raises:
-            BodyFailed: naming the robot, if a body raised, hung, or returned a number that is not finite.
+        Raises BodyFailed if a body raised, hung, or returned a number that is not finite.
         """
         robot, (observation, _, iterations, kept), bodies = self.robot, self._now, self._bodies
         actions, reward = robot.actions(commands), np.zeros(len(bodies))

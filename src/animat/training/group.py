@@ -74,7 +74,7 @@ def train_groups(
     at once changes the last bits.
 
     Args:
-        groups: groups that one program can train (`animat.execution.gpu.group_by_program`).
+        groups: that one program can train (`animat.execution.gpu.group_by_program`).
         checkpoint: file written atomically from time to time; the caller removes it when it is no longer needed.
         progress: updated after each chunk with the number done and the mean return of the episodes that ended in it.
         checkpoint_s: seconds between checkpoints; they change how much is repeated, never the result.
@@ -194,10 +194,8 @@ class SideBySide:
     def train(self, index: int, *simulators: NeuronSimulator | None) -> float:
         """Train one chunk with the simulator of each group; `index` counts from 0, also beyond those of the training.
 
-        Returns the mean return of the episodes that ended in it, NaN if none ended.
-
-        Raises:
-            UnusableData: if policies that are diagnosed are no longer finite.
+        Returns the mean return of the episodes that ended in it, NaN if none ended. Raises UnusableData if policies
+        that are diagnosed are no longer finite.
         """
         training, simulator = self._groups[0].training, simulators[0]
         algorithm = training.algorithm

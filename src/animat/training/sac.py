@@ -174,13 +174,8 @@ def train_chunk(
 ) -> tuple[Learner, Finished]:
     """Act and learn for some rounds with one simulator; in a round every environment does one iteration.
 
-    Args:
-        environment: the environment that the policy acts in (static).
-        settings: settings of the algorithm (static).
-        learner: the policy under training.
-        simulator: the simulator of the neurons during this chunk; None without neurons.
-        first_round, last_round: the rounds of the chunk, from the first up to but excluding the last; the same for all
-            policies that are trained side by side.
+    Environment and settings are static. The rounds are those from the first up to but excluding the last, the same for
+    all policies that are trained side by side.
     """
     acting, learning = uniform_shapes(environment, settings)
     n_acting = math.prod(acting)
@@ -230,9 +225,6 @@ def shaped(
 
     with d for ended (terminated or truncated), as in the losses. Over any episode the discounted terms add up to
     -potential(s_0), regardless of the actions (Ng, Harada & Russell 1999). Reported returns do not include them.
-
-    Args:
-        before, after: states of the robot, with an axis of environments.
     """
     if not hasattr(robot, "potential"):
         return reward

@@ -24,15 +24,7 @@ def chart(
     until: float | None = None,
     width: Width = "two-thirds",
 ) -> dict[str, Any]:
-    """Curves over one axis.
-
-    Args:
-        x, y: names of the axes, with units.
-        series: each made by `curve`.
-        note: how to read it, with its main numbers.
-        marks: places on the x axis with their labels.
-        until: the smallest end of the x axis.
-    """
+    """Curves (`curve`) over one axis, which reaches to `until` at least; `marks` are places on it with their labels."""
     labelled = [[number(at), text(label)] for at, label in marks]
     return {
         "kind": "chart", "title": title, "x": x, "y": y, "series": list(series), "words": text(note, 2000),

@@ -41,11 +41,7 @@ def text_of(path: Path, most_bytes: int) -> str:
 
 
 def expect_own(path: Path) -> Path:
-    """Refuse a link, which may lead anywhere, and what would block its reader for ever, such as a pipe.
-
-    Raises:
-        InvalidFile: naming the file and what it is.
-    """
+    """Refuse a link, which may lead anywhere, and what would block its reader for ever, such as a pipe."""
     if path.is_symlink():
         raise InvalidFile(f"{path}: expected a file, got a link")
     return expect_plain_file(path)

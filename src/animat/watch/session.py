@@ -283,9 +283,7 @@ def _in_force(rows: Sequence[PercentilesSince], shown: Sequence[PercentilesSince
 def stop_session(folder: Path) -> None:
     """Ask a session to end, without waiting or reading anything first, as it may be urgent.
 
-    Raises:
-        InvalidArgument: if there is no session, or it has ended.
-        InvalidFile: if the file cannot be created.
+    Raises InvalidArgument if there is none, or it has ended, and InvalidFile if the file cannot be created.
     """
     if not (folder / LOG_FILE).is_file():
         raise InvalidArgument(f"{folder.name}: expected a session to stop, got none")

@@ -18,12 +18,7 @@ _MOST_SPAN_S = 60.0
 
 
 class View(abc.ABC):
-    """A folder that is viewed repeatedly.
-
-    Attributes:
-        kind: of the folder.
-        file: that identifies it.
-    """
+    """A folder of one `kind` that is viewed repeatedly; `file` identifies it."""
 
     kind: ClassVar[Kind]
 
@@ -39,9 +34,7 @@ class View(abc.ABC):
     def view(self, to_s: float | None, span_s: float) -> dict[str, Any]:
         """The current view, of the seconds before a time (None: now, or the end); most views have no clock.
 
-        Raises:
-            InvalidFile: if the folder's files cannot be read, or hold something else.
-            InvalidArgument: for an invalid span.
+        Raises InvalidFile if the folder's files cannot be read, or hold something else.
         """
         if not 0 < span_s <= _MOST_SPAN_S:
             raise InvalidArgument(f"span: expected above 0 and at most {_MOST_SPAN_S:g} s, got {span_s:g}")

@@ -51,9 +51,7 @@ def compare_passing(
     w = n1 n0 / (n1 + n0), so neither differences between conditions nor drift count. Its standard error is that of
     independent responses, sqrt(sum w p (1 - p) n / (n - 1)) / sum w, with n = n1 + n0 and p = (n1 p1 + n0 p0) / n.
 
-    Args:
-        is_usable: which responses to compare.
-        in_group: which of some rows are in the group, given the median of their stretch, Hz.
+    `in_group` says which of some rows are in the group, given the median of their stretch, Hz.
 
     Source: Cochran 1954 (doi:10.2307/3001616), differences of proportions in several tables; Mantel and Haenszel 1959
     (doi:10.1093/jnci/22.4.719), n / (n - 1), as there may be few responses in a table.
