@@ -119,11 +119,7 @@ def coupling_of(environment: Environment[Any], simulator: NeuronSimulator | None
 
 
 def interventions_of(
-    environment: Environment[Any],
-    simulator: NeuronSimulator,
-    policies: Networks,
-    *,
-    switch_at: int | None = None,
+    environment: Environment[Any], simulator: NeuronSimulator, policies: Networks, *, switch_at: int | None = None
 ) -> list[Control]:
     """The same policies with one change each, to find out what the culture contributes.
 

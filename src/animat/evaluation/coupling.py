@@ -73,11 +73,7 @@ class Coupling(Actor):
 
 
 def best_coupling(
-    environment: Environment[Any],
-    simulator: NeuronSimulator | None,
-    *,
-    seed: int = 1,
-    progress: Progress | None = None,
+    environment: Environment[Any], simulator: NeuronSimulator | None, *, seed: int = 1, progress: Progress | None = None
 ) -> Coupling:
     """The best coupling for an environment and the neurons in it, as one actor for `roll_out`.
 

@@ -292,12 +292,7 @@ class Traces(NamedTuple):
 
 
 def trace(
-    environment: Environment[Any],
-    simulator: NeuronSimulator | None,
-    actors: Actor,
-    *,
-    episodes: int,
-    seed: int,
+    environment: Environment[Any], simulator: NeuronSimulator | None, actors: Actor, *, episodes: int, seed: int
 ) -> Traces:
     """Run episodes of each actor on a robot in JAX; arguments as in `animat.evaluation.rollouts.roll_out`."""
     n_actors = actors.n_actors
