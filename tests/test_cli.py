@@ -33,7 +33,7 @@ from animat.evaluation.resampling import WellSampled
 from animat.neurons.timeline import fit_timeline
 from animat.recordings.findings import Finding
 from animat.recordings.reading import read_recordings
-from animat.responses.series import extract_series
+from animat.responses.extraction import extract_series
 from animat.robots import Cartpole
 from animat.training.policy import Policy
 from animat.training.settings import SAC

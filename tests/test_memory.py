@@ -27,10 +27,9 @@ from animat.evaluation.optimum import best_return, best_returns
 from animat.evaluation.rollouts import Constant, Uniform, heuristic_policy, networks_of, roll_out
 from animat.execution.training import train
 from animat.neurons.fidelity import fidelity
-from animat.neurons.kinds import Kind
 from animat.neurons.memory import NO_MEMORY, Memory, MemorySimulator, _slopes, fit_memory
 from animat.neurons.simulator import EmpiricalSimulator, fit_empirical
-from animat.neurons.timeline import fit_timeline, load_timeline, save_timeline
+from animat.neurons.timeline import Kind, fit_timeline, load_timeline, save_timeline
 from animat.reality_gap import Calibration
 from animat.recordings.findings import Finding
 from animat.recordings.formats.nwb import write_nwb

@@ -42,7 +42,7 @@ from animat.progress import Progress, Silent
 from animat.recordings.formats.nwb import recording_name, write_nwb
 from animat.recordings.reading import read_recording, read_recordings
 from animat.report.html import cell, with_error
-from animat.responses.series import extract_series
+from animat.responses.extraction import extract_series
 from animat.robots import Cartpole, Navigation
 from animat.stimulation.protocol import Protocol, read_protocol
 from animat.stimulation.selection import SelectionRule

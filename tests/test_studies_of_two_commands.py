@@ -16,7 +16,7 @@ from animat.execution.training import train
 from animat.neurons.timeline import fit_timeline, load_timeline
 from animat.progress import Silent
 from animat.recordings.reading import read_recordings
-from animat.responses.series import extract_series
+from animat.responses.extraction import extract_series
 from animat.robots import Wheels
 from animat.stimulation.protocol import TWO_COMMANDS
 from animat.studies.recording import Record

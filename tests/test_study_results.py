@@ -25,7 +25,7 @@ from animat.neurons.timeline import SimulatorTimeline, fit_timeline
 from animat.progress import Silent
 from animat.recordings.reading import read_recordings
 from animat.report.results import ComparedReturns, Results, Score, StudyOptimum
-from animat.responses.series import extract_series
+from animat.responses.extraction import extract_series
 from animat.robots import Navigation
 from animat.studies.episodes import COLUMNS, RANDOM, episode_rows, mean_returns, read_episodes, write_episodes
 from animat.studies.evaluating import Evaluate

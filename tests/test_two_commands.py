@@ -37,9 +37,8 @@ from animat.reality_gap import Calibration, run_policies
 from animat.reality_gap.session_responses import read_responses
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.recording import Recording
-from animat.responses.extraction import extract_responses
+from animat.responses.extraction import extract_responses, extract_series
 from animat.responses.readouts import ALL, Readouts
-from animat.responses.series import extract_series
 from animat.robots import Cartpole, Robot
 from animat.robots.checking import check_robot
 from animat.robots.registry import REGISTRY

@@ -13,14 +13,8 @@ from animat.errors import InvalidFile, Mismatch
 _LONGEST = 60
 
 
-class _Nothing:
-    """The value of a missing key."""
-
-    def __repr__(self) -> str:
-        return "nothing"
-
-
-_NOTHING = _Nothing()
+_NOTHING = object()
+"""The value of a missing key."""
 
 
 def first_difference(
@@ -82,5 +76,5 @@ def folder_mismatch(folder: Path, what: str, difference: str) -> Mismatch:
 
 
 def _short(value: Any) -> str:
-    text = repr(value)
+    text = "nothing" if value is _NOTHING else repr(value)
     return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 3]}..."

@@ -35,7 +35,6 @@ class Control:
 
     Attributes:
         name: `random`, `constant 5 Hz`, `heuristic`, `silent` or `shuffled`, or the name of an intervention.
-        meaning: a short description.
         actor: one actor, or the policies side by side.
         delivery: `"chosen"`: neurons get what was chosen; `"shuffled"`: a condition drawn at random in each iteration;
             `"silent"`: nothing; `"yoked"`: the stimuli of another episode.

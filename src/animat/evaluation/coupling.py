@@ -169,7 +169,6 @@ class ContextGap:
 
     Attributes:
         coupling: mean return of the best coupling.
-        standard_error: of `coupling`.
         gap: with its interval for the episodes and the optimum's grid. None if the optimum is not above random
             stimuli, or with one episode.
         best_known: mean return of the best known agent, which replaces the optimum; None if the optimum is known.

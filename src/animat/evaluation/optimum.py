@@ -53,12 +53,9 @@ class Optimum:
         grid_error: difference from the value on a grid with 3/4 of the steps along each axis.
         monte_carlo: mean return of that controller, run on the environment itself: an achievable return, the lower end
             of the bracket. NaN if it was not run, as are the next three.
-        standard_error: of `monte_carlo`.
         without_clock: mean return of the same controller if it always acts as if the whole episode lay ahead: what is
             achievable without knowing the time, like a policy. A better one may exist, not above `value`.
-        without_clock_standard_error: of `without_clock`.
         episodes: in which both were measured; 0 if the controller was not run.
-        nodes: of the grid.
         interval: of the value, given the number of responses (`animat.evaluation.resampling`); None if it was not
             computed.
         left_out: conditions with too few responses, with their number.

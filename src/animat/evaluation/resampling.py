@@ -12,9 +12,8 @@ from animat.environment import Animat
 from animat.errors import UnusableData
 from animat.evaluation.optimum import Optimum, optimal_values
 from animat.evaluation.statistics import CONFIDENCE, Interval
-from animat.neurons.kinds import fit_simulator
 from animat.neurons.simulator import NeuronSimulator
-from animat.neurons.timeline import SimulatorTimeline
+from animat.neurons.timeline import SimulatorTimeline, fit_simulator
 from animat.progress import Progress
 from animat.responses.condition import Condition
 from animat.responses.quality.responses import FEW_SAMPLES

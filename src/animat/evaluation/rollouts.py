@@ -140,7 +140,6 @@ class Episodes:
 
     Attributes:
         returns: sum of rewards of each episode, in the task's own units.
-        lengths: iterations of each.
         terminated: whether it ended by itself and not at the episode limit.
         presented: how often each condition was delivered, in all episodes together; no conditions without neurons.
         commanded: the sum of the commands that each condition led to; several commands separately.

@@ -22,8 +22,7 @@ from animat.evaluation.optimum import Optimum, best_return
 from animat.evaluation.resampling import WellSampled
 from animat.evaluation.rollouts import networks_of
 from animat.evaluation.row import Row
-from animat.evaluation.statistics import Interval, normalised_score
-from animat.evaluation.verdict import Verdict
+from animat.evaluation.statistics import Interval, Verdict, normalised_score
 from animat.goals.robot import objectives_of
 from animat.goals.tally import MEANS, cells_of, satisfaction_line
 from animat.neurons.simulator import NeuronSimulator
@@ -42,7 +41,6 @@ class Evaluation:
     """Trained policies and controls on one simulator.
 
     Attributes:
-        robot: the robot.
         mapping: its name; None without neurons.
         recorded_at_min: time of the simulator's recording; None without neurons.
         names: the policies, in the order of the first row's actors.

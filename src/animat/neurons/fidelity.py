@@ -31,7 +31,6 @@ class Fidelity:
             several readouts.
         in_simulator: the same for the simulator, in the same shape.
         n_above_range: non-burst responses, of any readout, above a histogram's range, counted in its last bin.
-        readouts: their names.
     """
 
     labels: tuple[str, ...]

@@ -12,7 +12,6 @@ from jaxtyping import Float64
 from animat.arguments import checked_arguments
 from animat.errors import InvalidArgument
 from animat.neurons.history import NO_MEMORY
-from animat.neurons.kinds import Kind, fit_simulator
 from animat.neurons.memory import MemorySimulator
 from animat.neurons.prediction import (
     CLASSES,
@@ -27,7 +26,7 @@ from animat.neurons.prediction import (
     share_below,
     shares_lasting,
 )
-from animat.neurons.timeline import default_kind
+from animat.neurons.timeline import Kind, default_kind, fit_simulator
 from animat.responses.responses import Responses
 from animat.tables import briefly
 

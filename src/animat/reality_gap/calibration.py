@@ -12,10 +12,9 @@ from jaxtyping import Float64
 from animat.arguments import checked_arguments
 from animat.coding.mapping import Thresholds
 from animat.neurons.history_tracker import AdjustedRanks, HistoryTracker
-from animat.neurons.kinds import Kind, fit_simulator
 from animat.neurons.memory import MemorySimulator
 from animat.neurons.simulator import NeuronSimulator
-from animat.neurons.timeline import fit_timeline, room_for
+from animat.neurons.timeline import Kind, fit_simulator, fit_timeline, room_for
 from animat.reality_gap.rereading import reread
 from animat.recordings.findings import Finding
 from animat.recordings.recorded_culture import RecordedCulture
@@ -146,7 +145,7 @@ class Calibration:
         )
         if adaptive or policy is None or policy.percentiles != "first":
             return calibration
-        return calibration.with_percentiles(timeline.with_first_percentiles().at(start_min).percentiles)
+        return calibration.with_percentiles(timeline.with_percentiles("first").at(start_min).percentiles)
 
     def with_percentiles(self, percentiles: Any) -> Self:
         """The same with one set of percentiles in all simulators, independent of their responses."""

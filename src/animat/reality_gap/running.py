@@ -26,6 +26,7 @@ from animat.errors import InvalidArgument
 from animat.evaluation.controls import RANDOM, Control, controls_of, coupling_of, interventions_of
 from animat.evaluation.resampling import too_few
 from animat.evaluation.rollouts import networks_of
+from animat.evaluation.statistics import compare_episodes
 from animat.evaluation.transfer import (
     expect_conditions,
     no_memory,
@@ -34,7 +35,6 @@ from animat.evaluation.transfer import (
     other_culture,
     other_simulator,
 )
-from animat.evaluation.verdict import compare_episodes
 from animat.goals.tally import Outcome
 from animat.progress import Progress, in_phase
 from animat.reality_gap.calibration import Calibration

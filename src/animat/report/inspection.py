@@ -19,8 +19,8 @@ from animat.report.raster import draw_raster, draw_spontaneous
 from animat.report.response_histograms import draw_response_histograms
 from animat.report.responses_over_time import draw_responses_over_time
 from animat.report.style import Figure, save_figure
+from animat.responses.bursts import BIN_S, NetworkBursts
 from animat.responses.inspection import Inspection
-from animat.responses.network_bursts import BIN_S, NetworkBursts
 from animat.responses.psth import PostStimulusHistogram, post_stimulus_histogram
 from animat.responses.responses import Responses
 

@@ -15,9 +15,9 @@ from animat.recordings.recording import Recording
 from animat.recordings.response_table import ResponseTable
 from animat.recordings.time_quality import TIME_UNITS
 from animat.records import as_json
+from animat.responses.bursts import NetworkBursts, find_network_bursts
 from animat.responses.conditions import Conditions
 from animat.responses.extraction import extract_responses
-from animat.responses.network_bursts import NetworkBursts, find_network_bursts
 from animat.responses.psth import ResponseTime, find_response, spontaneous_rate
 from animat.responses.responses import Responses
 from animat.responses.windows import DEFAULT_WINDOW_MS

@@ -49,7 +49,6 @@ class GymnasiumRobot(HostRobot):
     Attributes:
         id: as for `gymnasium.make`, prefixed by `module:` if importing that module registers it.
         settings: arguments of `gymnasium.make`, by name.
-        episode_limit: iterations after which an episode is cut off.
         low, high: for each dimension of a Box; empty for a Discrete.
         levels: n of a Discrete(n); 0: a Box.
         scales: of each number of the flattened observation.

@@ -21,16 +21,8 @@ from animat.robots.surroundings import MOST_PLACES, Obstacles, Surroundings, Wal
 SENSORS_DEG = (17.0, 46.0, 90.0, 151.0, -151.0, -90.0, -46.0, -17.0)
 """Directions of the e-puck's proximity sensors, IR0 to IR7, clockwise from straight ahead."""
 
-SENSORS = (
-    "right_front",
-    "right_diagonal",
-    "right_side",
-    "right_back",
-    "left_back",
-    "left_side",
-    "left_diagonal",
-    "left_front",
-)
+_PARTS = ("front", "diagonal", "side", "back")
+SENSORS = (*(f"right_{part}" for part in _PARTS), *(f"left_{part}" for part in reversed(_PARTS)))
 
 APART, SLIPPING = 0.4, 0.21
 """In body radii: the spacing of the square lattice, through the start, from which goals are drawn; and the clearance on

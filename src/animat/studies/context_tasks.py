@@ -21,9 +21,9 @@ from animat.progress import EqualPhases, Progress
 from animat.reality_gap import Calibration, run_policies
 from animat.recordings.reading import read_sources
 from animat.records import Positive, Seed, record, write_json
+from animat.responses.extraction import extract_series
 from animat.responses.readouts import DEFAULT_READOUTS
 from animat.responses.responses import Responses
-from animat.responses.series import extract_series
 from animat.robots.host import HostRobot
 from animat.robots.registry import robot_named
 from animat.stimulation import protocol

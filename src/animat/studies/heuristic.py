@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from animat.evaluation.verdict import compare_episodes, is_worse
+from animat.evaluation.statistics import compare_episodes, is_worse
 from animat.report.results import HeuristicComparison, Results
 from animat.studies.episodes import POLICY, DataFrame, mean_returns, rows_where
 from animat.studies.evaluating import is_usual

@@ -12,9 +12,9 @@ from animat.neurons.timeline import SimulatorTimeline, fit_timeline, save_timeli
 from animat.progress import Progress
 from animat.recordings.findings import Finding
 from animat.recordings.reading import read_recordings
+from animat.responses.extraction import extract_series
 from animat.responses.readouts import ALL, readouts_named
 from animat.responses.responses import Responses
-from animat.responses.series import extract_series
 from animat.studies.places import RECORDINGS, RESPONSES, TIMELINE
 from animat.studies.results import write_table
 from animat.studies.specification import Study

@@ -78,7 +78,7 @@ class Simulators:
     def __post_init__(self) -> None:
         from animat.neurons.simulator import check_binning
         from animat.responses.conditions import conditions_named
-        from animat.responses.series import check_allowed
+        from animat.responses.extraction import check_allowed
         from animat.responses.windows import check_window
 
         # Checked before anything is recorded, as a later correction would need another folder.

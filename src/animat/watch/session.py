@@ -25,12 +25,11 @@ from animat.progress import format_duration
 from animat.robots.base import Robot
 from animat.robots.drawing import draw_robot
 from animat.stimulation.stimulus import NOTHING
-from animat.watch.blocks import time_left
 from animat.watch.discovery import is_locked
 from animat.watch.plain import mapped, number, numbers, packed, text
 from animat.watch.sums import PercentilesSince, Sums, by_agent, first_readout
 from animat.watch.tail import Tail
-from animat.watch.view import View
+from animat.watch.view import View, time_left
 
 _MOST_RECORDS = 8000
 """Most records in a view: at 80 Hz more than a minute and a half."""

@@ -31,10 +31,8 @@ class Sums:
     """The totals of a log's records counted so far.
 
     Attributes:
-        counted: number of records counted.
         totals: for each record the return of its episode so far; NaN without a tick.
         wall_s: of the last tick, on the program's clock; None before the first.
-        on_electrode: number of pulses on each electrode.
         faults: the last ones: when, on the session's clock, and what happened.
         percentiles: the thresholds since each change.
         strange: number of records that are not understood.

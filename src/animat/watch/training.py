@@ -12,11 +12,10 @@ from jaxtyping import Float64
 
 from animat.execution.task import UNFINISHED
 from animat.training.policy import CURVE
-from animat.watch.blocks import chart, curve, facts, table, time_left
 from animat.watch.discovery import changed_s, state_of
 from animat.watch.files import JobProgress, curve_of_policy, curves_of_checkpoint, job_progress, json_of
 from animat.watch.plain import listed, mapped, number, settings, text
-from animat.watch.view import View, in_blocks
+from animat.watch.view import View, chart, curve, facts, in_blocks, table, time_left
 
 _MOST_POLICIES = 1000
 _CHUNKS = 60
