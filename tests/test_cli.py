@@ -28,8 +28,8 @@ from animat.coding.mapping import Thresholds
 from animat.cultures.series import Series
 from animat.environment import Animat
 from animat.errors import InvalidArgument
+from animat.evaluation.optimal_returns import WellSampled
 from animat.evaluation.optimum import Optimum, best_return
-from animat.evaluation.resampling import WellSampled
 from animat.neurons.timeline import fit_timeline
 from animat.recordings.findings import Finding
 from animat.recordings.reading import read_recordings

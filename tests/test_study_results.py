@@ -302,7 +302,7 @@ def test_conditions_of_few_responses_are_left_out_of_a_study_s_optima_and_named(
     # As many as the fewest at 0 min has, and one more: at 140 min all have as many.
     enough = min(n[0]) + 1
     assert min(n[1]) >= enough > min(n[0])
-    monkeypatch.setattr("animat.evaluation.resampling.FEW_SAMPLES", enough)
+    monkeypatch.setattr("animat.evaluation.optimal_returns.FEW_SAMPLES", enough)
     few = [i for i in range(5) if n[0][i] < enough]
     at_first, at_last, without = optima_of(recorded)
     assert at_first.left_out == "; ".join(f"{series[0].conditions[i].label} ({n[0][i]})" for i in few)
@@ -367,7 +367,7 @@ def test_lines_of_learning_curves_are_of_the_simulator_in_use(tmp_path: Path) ->
 def test_where_no_condition_has_enough_responses_a_study_has_no_optimum(
     recorded: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("animat.evaluation.resampling.FEW_SAMPLES", 41)
+    monkeypatch.setattr("animat.evaluation.optimal_returns.FEW_SAMPLES", 41)
     at_first, at_last, without = optima_of(recorded)
     for row in (at_first, at_last):
         assert row.left_out.count(" Hz (") == 5

@@ -56,7 +56,7 @@ class Optimum:
         without_clock: mean return of the same controller if it always acts as if the whole episode lay ahead: what is
             achievable without knowing the time, like a policy. A better one may exist, not above `value`.
         episodes: in which both were measured; 0 if the controller was not run.
-        interval: of the value, given the number of responses (`animat.evaluation.resampling`); None if it was not
+        interval: of the value, given the number of responses (`animat.evaluation.optimal_returns`); None if it was not
             computed.
         left_out: conditions with too few responses, with their number.
     """

@@ -18,8 +18,8 @@ from animat.evaluation import transfer
 from animat.evaluation.controls import Control, controls_of, coupling_of
 from animat.evaluation.coupling import ContextGap, context_gap, least_context_gap
 from animat.evaluation.interventions import InterventionTable, run_interventions
+from animat.evaluation.optimal_returns import WellSampled
 from animat.evaluation.optimum import Optimum, best_return
-from animat.evaluation.resampling import WellSampled
 from animat.evaluation.rollouts import networks_of
 from animat.evaluation.row import Row
 from animat.evaluation.statistics import Interval, Verdict, normalised_score

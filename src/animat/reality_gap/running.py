@@ -24,7 +24,7 @@ from animat.cultures.virtual import VirtualCulture
 from animat.environment import Animat, Environment
 from animat.errors import InvalidArgument
 from animat.evaluation.controls import RANDOM, Control, controls_of, coupling_of, interventions_of
-from animat.evaluation.resampling import too_few
+from animat.evaluation.optimal_returns import too_few
 from animat.evaluation.rollouts import networks_of
 from animat.evaluation.statistics import compare_episodes
 from animat.evaluation.transfer import (

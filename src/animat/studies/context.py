@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from animat.cultures.tissue.parameters import REVISION
-from animat.differences import with_fingerprint
 from animat.execution.jobs import Job, expect_workers
+from animat.folders import with_fingerprint
 from animat.progress import Progress
 from animat.report.results import ContextRow, LostRow
 from animat.robots.registry import robot_named

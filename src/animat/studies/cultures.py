@@ -20,7 +20,7 @@ from animat.execution.cluster import Cluster
 from animat.execution.gpu import find_gpu
 from animat.execution.jobs import expect_workers
 from animat.execution.pinned import PinnedProcesses, own_cores
-from animat.folder_kinds import expect_no_other
+from animat.folders import expect_no_other
 from animat.progress import Progress, Silent
 from animat.report.results import ComparedReturns, OverCultures, Results, Score
 from animat.studies.places import results_file

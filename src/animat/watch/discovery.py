@@ -14,7 +14,7 @@ from animat.closed_loop.session_data import LOG_FILE
 from animat.cultures.under_way import UNDER_WAY
 from animat.errors import InvalidArgument
 from animat.execution.task import UNFINISHED
-from animat.folder_kinds import MARKERS, Kind
+from animat.folders import MARKERS, Kind
 from animat.writing import LOCK
 
 _MARKS = {kind: names[0] for kind, names in MARKERS.items() if kind not in ("recording", "live")}

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 from animat.errors import InvalidArgument, InvalidFile, first_line
-from animat.folder_kinds import MARKERS, Kind
+from animat.folders import MARKERS, Kind
 from animat.progress import Speed, format_duration
 from animat.watch.files import json_of
 from animat.watch.plain import number, text
