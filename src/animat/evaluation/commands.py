@@ -108,10 +108,7 @@ def commands_of(environment: Environment[Any], simulator: NeuronSimulator | None
 def mean_commands(
     environment: Environment[Any], simulator: NeuronSimulator | None
 ) -> tuple[np.ndarray, Float64[np.ndarray, "actions *commands"]]:
-    """The environment's input for each action, and the mean command that it leads to; errors as in `commands_of`.
-
-    Several commands are averaged over 2048 responses of equal probability.
-    """
+    """The environment's input for each action, and the mean command that it leads to; errors as in `commands_of`."""
     animat = unwrapped(environment)
     if isinstance(animat, Animat) and simulator is not None and animat.robot.n_commands > 1:
         commands = decode(animat.mapping, simulator.evenly_drawn(_QUANTILES), jnp.asarray(simulator.percentiles))

@@ -130,10 +130,7 @@ def _iterations(
     keys: Key[Array, " actors"],
     bodies: Bodies,
 ) -> Iterator[tuple[np.ndarray, np.ndarray, StepResult]]:
-    """The commands, delivered conditions and results of each iteration of bodies that have begun, for the same actors.
-
-    Ended episodes begin again: a body must not be stepped after its end.
-    """
+    """Commands, delivered conditions and results of each iteration of begun bodies; ended episodes begin again."""
     shape = len(keys), len(bodies) // len(keys)
     state = _started(environment, keys, shape[1])
     for iteration in range(environment.robot.episode_limit):

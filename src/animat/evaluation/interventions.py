@@ -81,10 +81,7 @@ class SwitchEffect:
 
 @dataclass(frozen=True, eq=False)
 class InterventionTable:
-    """The policies as they are and with each intervention, on one simulator.
-
-    `turning` is the effect of the goal switch, None for a robot with only one goal.
-    """
+    """The policies as they are and with each intervention, and the effect of a switch of the goal, if there is one."""
 
     __repr__ = briefly
 
@@ -124,11 +121,7 @@ def run_interventions(
 ) -> InterventionTable:
     """Run policies as they are and with every intervention of `animat.evaluation.controls.interventions_of`.
 
-    The goal is switched in the middle of the policies' median episode. `episodes` are of each policy and intervention;
-    `seed` decides every random draw.
-
-    Raises:
-        InvalidArgument: for an environment without neurons.
+    The goal is switched in the middle of the policies' median episode. Refuses an environment without neurons.
     """
     if simulator is None or not isinstance(unwrapped(environment), Animat):
         raise InvalidArgument("interventions: expected policies that act through neurons, got policies without neurons")

@@ -50,10 +50,7 @@ class WellSampled:
 
     @classmethod
     def of(cls, environment: Animat[Any], timeline: SimulatorTimeline, minute: float, percentiles: str) -> Self:
-        """Select the conditions of one recording of a timeline; UnusableData if none has enough responses.
-
-        `percentiles`: those of the mapping, as in `SimulatorTimeline.with_percentiles`.
-        """
+        """Select the conditions of one recording; `percentiles` as in `SimulatorTimeline.with_percentiles`."""
         responses, left_out = with_enough_samples(timeline.responses[timeline.row_at(minute)])
         simulator = timeline.with_percentiles(percentiles).at(minute)
         # The mapping's thresholds are those of all responses, even if some of them are left out.

@@ -9,9 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from animat.neurons.joint_histogram import JointHistogramSimulator
 from animat.neurons.memory import MemorySimulator
-from animat.neurons.simulator import HistogramSimulator, NeuronSimulator
+from animat.neurons.simulator import HistogramSimulator, JointHistogramSimulator, NeuronSimulator
 from animat.recordings.findings import Finding
 from animat.responses.responses import Responses
 

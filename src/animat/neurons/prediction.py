@@ -12,9 +12,14 @@ from jaxtyping import Array, Float, Float32, Float64, Int64
 
 from animat.errors import UnusableData
 from animat.neurons.history import Ranked
-from animat.neurons.joint_histogram import JointHistogramSimulator
 from animat.neurons.memory import MemorySimulator
-from animat.neurons.simulator import EmpiricalSimulator, HistogramSimulator, NeuronSimulator, pooled_percentiles
+from animat.neurons.simulator import (
+    EmpiricalSimulator,
+    HistogramSimulator,
+    JointHistogramSimulator,
+    NeuronSimulator,
+    pooled_percentiles,
+)
 from animat.responses.responses import Responses
 
 FEWEST = 20

@@ -18,14 +18,15 @@ from animat.arguments import checked_arguments
 from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch, in_min
 from animat.neurons.fidelity import Fidelity, fidelity
 from animat.neurons.history import Memory
-from animat.neurons.joint_histogram import JointHistogramSimulator, fit_joint_histogram
 from animat.neurons.memory import MemorySimulator, fit_memory
 from animat.neurons.simulator import (
     EmpiricalSimulator,
     HistogramSimulator,
+    JointHistogramSimulator,
     NeuronSimulator,
     fit_empirical,
     fit_histogram,
+    fit_joint_histogram,
     stacked,
     to_jax,
 )

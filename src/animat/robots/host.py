@@ -93,10 +93,7 @@ class HostRobot(Robot[Any]):
 
 
 class StepResult(NamedTuple):
-    """The result of a step of several bodies, before ended episodes restart.
-
-    A body, or the robot's `episode_limit`, may cut off an episode (`truncated`) whose task has not ended itself.
-    """
+    """The result of a step of several bodies, before ended episodes restart; a body or the limit may truncate one."""
 
     observation: Float32[np.ndarray, "bodies observations"]
     reward: Float64[np.ndarray, " bodies"]
@@ -247,10 +244,8 @@ class _TooLongError(BaseException):
 
 @contextmanager
 def time_limit(name: str, what: str) -> Iterator[None]:
-    """Raise BodyFailed if external code takes longer than `PATIENCE_S`, when it returns to Python.
-
-    This works only in a process's main thread, the only one to receive signals.
-    """
+    """Raise BodyFailed if external code takes longer than `PATIENCE_S`, when it returns to Python."""
+    # Only the main thread receives signals.
     if threading.current_thread() is not threading.main_thread():
         yield
         return

@@ -31,10 +31,7 @@ ASSESSED = ("iterations", "minute", "lesson", "success", "mean_return")
 def assess(
     environment: Varied[Any], episodes: int, actor: Network, simulator: NeuronSimulator | None, key: PRNGKeyArray
 ) -> tuple[Float[Array, " episodes"], Bool[Array, " episodes"]]:
-    """The return of each episode of a policy's most probable actions, and whether it succeeded.
-
-    With the same key in each assessment of a training, its policies and minutes are comparable.
-    """
+    """The return of each episode of a policy's most probable actions, and whether it succeeded."""
     limited = EpisodeLimit(environment)
     start_key, iteration_key = jax.random.split(key)
     started = jax.vmap(limited.reset)(jax.random.split(start_key, episodes)).carried
@@ -176,6 +173,7 @@ class Course:
 
     def _scores(self, networks: Network, simulator: NeuronSimulator | None) -> Float64[np.ndarray, "policies 2"]:
         """Each policy's share of successes (NaN for a robot that does not report success) and mean return."""
+        # The same in each assessment of a training, so that its policies and minutes are comparable.
         key = jax.random.fold_in(jax.random.key(self._training.seed), MOST_POLICIES)
         returns, succeeded = map(np.asarray, self._programs[2](self.ranges, networks, simulator, key))
         success = np.where(hasattr(self._training.robot, "succeeded"), succeeded.mean(axis=1), np.nan)

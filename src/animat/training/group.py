@@ -47,10 +47,7 @@ AddChunk: TypeAlias = Callable[[Chunk], None]
 
 @dataclass(frozen=True, eq=False)
 class Group:
-    """Some of a training's policies, by their numbers, and the simulators they are trained on.
-
-    A checkpoint with another fingerprint is refused. The provenance is stored in the policies.
-    """
+    """Some of a training's policies, by their numbers, and the simulators they are trained on."""
 
     training: Training
     members: tuple[int, ...]

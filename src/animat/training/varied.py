@@ -130,7 +130,8 @@ def with_parameters(robot: Kind, values: Mapping[str, Any]) -> Kind:
 def expect_varied(robot: Robot[Any], varying: Varying) -> None:
     """Refuse what cannot vary in this robot, by tracing it."""
     state = jax.eval_shape(without_goal(robot).reset, jax.random.key(0))
-    known = [name for name in getattr(state, "_fields", ()) if _is_number(getattr(state, name))]
+    leaves = {name: getattr(state, name) for name in getattr(state, "_fields", ())}
+    known = [n for n, x in leaves.items() if getattr(x, "shape", None) == () and jnp.issubdtype(x.dtype, jnp.floating)]
     for name in varying.starts:
         if name not in known:
             near = did_you_mean(name, known) or f"; there are {', '.join(known) or 'none'}"
@@ -159,10 +160,6 @@ def _started(robot: Robot[Any], state: Any, drawn: Mapping[str, Array]) -> Any:
     body = state.robot if isinstance(robot, RobotWithGoal) else state
     body = body._replace(**{n: jnp.where(jnp.isnan(value), getattr(body, n), value) for n, value in drawn.items()})
     return robot.started(body) if isinstance(robot, RobotWithGoal) else body
-
-
-def _is_number(leaf: Any) -> bool:
-    return getattr(leaf, "shape", None) == () and jnp.issubdtype(leaf.dtype, jnp.floating)
 
 
 def _between(key: PRNGKeyArray, ends: Float[Stored, "2 numbers"]) -> Float[Array, " numbers"]:

@@ -36,10 +36,7 @@ class Item:
 
 
 def find(folder: Path) -> list[Item]:
-    """The items in a folder and its subfolders, newest first, without links.
-
-    A folder that does not exist yet holds none.
-    """
+    """The items in a folder, which need not exist yet, and its subfolders, newest first, without links."""
     items = [item for subfolder in _folders(folder) for item in _in_folder(folder, subfolder)]
     items.sort(key=lambda item: (-item.changed_s, item.place))
     # An item that contains the others is kept, however many are newer.

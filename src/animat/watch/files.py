@@ -87,10 +87,7 @@ def _complete(curve: np.ndarray, dimensions: int) -> Float64[np.ndarray, "*_ col
 
 
 def mean_of_episodes(path: Path) -> tuple[float, int, int] | None:
-    """Mean return, number of policies and number of episodes of an arm of a study; None if it has no own episodes.
-
-    A file that holds something else may raise any error.
-    """
+    """Mean return, number of policies and number of episodes of an arm of a study; None if it has no own episodes."""
     arrays = _arrays_in(path, ("return", "actor", "over_time", "agent", "at_min"), _MOST_EPISODES_BYTES)
     if arrays is None:
         raise InvalidFile(f"{path}: expected the episodes of an arm")

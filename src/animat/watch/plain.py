@@ -64,8 +64,7 @@ def packed(
 ) -> tuple[dict[str, Any], list[int]]:
     """The spikes of a span on n channels, and their number on each.
 
-    Times are 0 (the span's start) to 65,535 (its end); times and channels are uint16 in base64. Channels beyond 65,535
-    are counted but not drawn.
+    Times, from 0 (the span's start) to 65,535 (its end), and channels, of which larger ones are not drawn, are uint16.
     """
     with np.errstate(invalid="ignore"):
         within = (times_s >= from_s) & (times_s <= to_s) & (channels >= 0) & (channels < n)

@@ -90,6 +90,7 @@ class SessionView(View):
         loop, channels = fields["loop"], header.channels
         # In older logs it is a name.
         mapping = mapped(loop.get("mapping")).get("name", loop.get("mapping"))
+        percentiles = {kind.name: list(kind.percentile_indices) for kind in (Thresholds(1), Thresholds(9))}
         return {
             "generation": self.tail.generation,
             "title": self._title(),
@@ -97,7 +98,8 @@ class SessionView(View):
             "observed": list(map(text, header.observed)),
             "readouts": list(map(text, header.readouts)),
             "mapping": text(mapping),
-            "thresholds": _thresholds(mapping),
+            # Which of the eleven percentiles it compares responses with; both ends if not known.
+            "thresholds": percentiles.get(mapping, [0, 10]),
             "adaptive": bool(loop.get("adaptive")),
             "percentiles_hz": first_readout(loop.get("percentiles")),
             "planned": len(fields.get("turns", ())),
@@ -261,12 +263,6 @@ def _span(fields: dict[str, Any]) -> tuple[float, float] | None:
     if fields.get("kind") != "seen" or start_s is None or duration_s is None:
         return None
     return start_s, start_s + duration_s
-
-
-def _thresholds(mapping: Any) -> list[int]:
-    """Which of the eleven percentiles a mapping compares responses with; both ends if not known."""
-    known = {kind.name: list(kind.percentile_indices) for kind in (Thresholds(1), Thresholds(9))}
-    return known.get(mapping, [0, 10])
 
 
 def _in_force(rows: Sequence[PercentilesSince], shown: Sequence[PercentilesSince]) -> list[PercentilesSince]:
