@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 from dataclasses import dataclass
-from typing import Any, Generic, NamedTuple, TypeVar, final
+from typing import Any, Generic, NamedTuple, TypeAlias, TypeVar, final
 
 import jax
 import jax.numpy as jnp
@@ -24,6 +24,8 @@ RobotState = TypeVar("RobotState")
 Uniforms = Float[Array, " noise"]
 Number = Float[Array, ""]
 Flag = Bool[Array, ""]
+Neurons: TypeAlias = NeuronSimulator | None
+"""The simulator of the neurons that move a robot; None without neurons."""
 
 _NOT_CARRIED = ("delivered", "rate_hz", "command")
 """Entries of `info` about the last iteration, which the next one does not need."""
@@ -113,10 +115,10 @@ class Environment(abc.ABC, Generic[RobotState]):
         )
 
     @abc.abstractmethod
-    def respond(self, uniforms: Uniforms, state: State, action: Array, simulator: NeuronSimulator | None) -> Responded:
+    def respond(self, uniforms: Uniforms, state: State, action: Array, simulator: Neurons) -> Responded:
         """The result of an action before the robot moves; arguments as in `advance`."""
 
-    def advance(self, uniforms: Uniforms, state: State, action: Array, simulator: NeuronSimulator | None) -> State:
+    def advance(self, uniforms: Uniforms, state: State, action: Array, simulator: Neurons) -> State:
         """One iteration, with its random numbers as an argument: training draws them for many iterations at once.
 
         Args:
@@ -131,7 +133,7 @@ class Environment(abc.ABC, Generic[RobotState]):
         return State(robot, state.iteration + 1, answer.history, reward, Ended(terminated, jnp.bool_(False)), info)
 
     @final
-    def step(self, key: PRNGKeyArray, state: State, action: Array, simulator: NeuronSimulator | None) -> State:
+    def step(self, key: PRNGKeyArray, state: State, action: Array, simulator: Neurons) -> State:
         """One iteration: action, response, command, movement."""
         return self.advance(jax.random.uniform(key, (self.noise_size,)), state, action, simulator)
 
@@ -173,7 +175,7 @@ class Animat(Environment[RobotState]):
         # neurons get the same random numbers.
         return self.robot.noise_size + 2
 
-    def respond(self, uniforms: Uniforms, state: State, action: Array, simulator: NeuronSimulator | None) -> Responded:
+    def respond(self, uniforms: Uniforms, state: State, action: Array, simulator: Neurons) -> Responded:
         if simulator is None:
             raise InvalidArgument("simulator: expected a neuron simulator, which an Animat needs, got None")
         expect_fit(self.robot.name, self.robot.n_commands, simulator.n_readouts)
@@ -209,7 +211,7 @@ class WithoutNeurons(Environment[RobotState]):
     def noise_size(self) -> int:
         return self.robot.noise_size
 
-    def respond(self, uniforms: Uniforms, state: State, action: Array, simulator: NeuronSimulator | None) -> Responded:
+    def respond(self, uniforms: Uniforms, state: State, action: Array, simulator: Neurons) -> Responded:
         no_answer = Answer(jnp.float32(jnp.nan), state.neurons)
         command = action if self.commands is None else jnp.asarray(self.commands, jnp.float32)[action]
         return Responded(action, no_answer, jnp.clip(command, -1.0, 1.0))

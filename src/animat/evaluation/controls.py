@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float64
 
-from animat.environment import Animat, Environment
+from animat.environment import Animat, Environment, Neurons
 from animat.evaluation.commands import mean_commands
 from animat.evaluation.coupling import best_coupling
 from animat.evaluation.rollouts import Actor, Constant, Episodes, Networks, Uniform, heuristic_policy, roll_out
@@ -55,9 +55,7 @@ class Control:
     switch_at: int | None = None
     commands: tuple[Any, ...] | None = None
 
-    def within(
-        self, environment: Environment[Any], simulator: NeuronSimulator | None
-    ) -> tuple[Environment[Any], NeuronSimulator | None]:
+    def within(self, environment: Environment[Any], simulator: Neurons) -> tuple[Environment[Any], Neurons]:
         """The policies' environment and simulator, changed for this control; the same objects if nothing changes."""
         if self.is_turned_round or self.commands is not None:
             animat = unwrapped(environment)
@@ -77,9 +75,7 @@ class Control:
             environment = GoalSwitch(environment, self.switch_at)
         return environment, simulator
 
-    def run(
-        self, environment: Environment[Any], simulator: NeuronSimulator | None, *, episodes: int, seed: int
-    ) -> Episodes:
+    def run(self, environment: Environment[Any], simulator: Neurons, *, episodes: int, seed: int) -> Episodes:
         """Its episodes in the policies' environment and simulator, changed for it; errors as in `roll_out`."""
         return roll_out(*self.within(environment, simulator), self.actor, episodes=episodes, seed=seed)
 
@@ -88,10 +84,7 @@ RANDOM = Control("random", "any action, equally likely", Uniform())
 
 
 def controls_of(
-    environment: Environment[Any],
-    simulator: NeuronSimulator | None,
-    labels: Sequence[str],
-    policies: Networks | None = None,
+    environment: Environment[Any], simulator: Neurons, labels: Sequence[str], policies: Networks | None = None
 ) -> list[Control]:
     """The controls of an environment.
 
@@ -113,7 +106,7 @@ def controls_of(
     return controls
 
 
-def coupling_of(environment: Environment[Any], simulator: NeuronSimulator | None, *, seed: int) -> Control:
+def coupling_of(environment: Environment[Any], simulator: Neurons, *, seed: int) -> Control:
     """The best coupling as a control; arguments and errors as in `best_coupling`, whose search takes seconds."""
     reflex = best_coupling(environment, simulator, seed=seed)
     return Control("coupling", "the best reflex: no memory, no goal", reflex)

@@ -14,13 +14,12 @@ from jaxtyping import Array, Float, Float64, Int
 from scipy.optimize import differential_evolution
 from scipy.stats import t as student_t
 
-from animat.environment import Environment
+from animat.environment import Environment, Neurons
 from animat.errors import InvalidArgument
 from animat.evaluation.commands import mean_commands
 from animat.evaluation.optimum import Optimum
 from animat.evaluation.rollouts import Actor, Seen, Uniforms, heuristic_policy, nearest_action, roll_out, trace
 from animat.evaluation.statistics import CONFIDENCE, Interval, standard_error
-from animat.neurons.simulator import NeuronSimulator
 from animat.progress import Progress
 from animat.robots.base import capability
 from animat.robots.host import HostRobot
@@ -73,7 +72,7 @@ class Coupling(Actor):
 
 
 def best_coupling(
-    environment: Environment[Any], simulator: NeuronSimulator | None, *, seed: int = 1, progress: Progress | None = None
+    environment: Environment[Any], simulator: Neurons, *, seed: int = 1, progress: Progress | None = None
 ) -> Coupling:
     """The best coupling for an environment and the neurons in it, as one actor for `roll_out`.
 
@@ -142,7 +141,7 @@ def best_coupling(
 
 
 def _near_heuristic(
-    environment: Environment[Any], simulator: NeuronSimulator | None, seen: tuple[int, ...], seed: int
+    environment: Environment[Any], simulator: Neurons, seen: tuple[int, ...], seed: int
 ) -> Float64[np.ndarray, "starts weights"]:
     """The coupling closest to the robot's heuristic, by least squares over its episodes, and steeper ones, if any."""
     robot = environment.robot

@@ -12,8 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, Key, PRNGKeyArray
 
 from animat.compilation import COMPILER_OPTIONS
-from animat.environment import Environment, State
-from animat.neurons.simulator import NeuronSimulator
+from animat.environment import Environment, Neurons, State
 from animat.robots.host import Bodies, HostRobot, StepResult
 
 AT_ONCE = 64
@@ -36,7 +35,7 @@ class Counts(NamedTuple):
 def roll_out_on_host(
     environment: Environment[Any],
     episodes: int,
-    simulator: NeuronSimulator | None,
+    simulator: Neurons,
     actors: Any,
     keys: Key[Array, " actors"],
     seed: int,
@@ -68,11 +67,7 @@ def roll_out_on_host(
 
 
 def paths_on_host(
-    environment: Environment[Any],
-    simulator: NeuronSimulator | None,
-    actors: Any,
-    keys: Key[Array, " actors"],
-    seed: int,
+    environment: Environment[Any], simulator: Neurons, actors: Any, keys: Key[Array, " actors"], seed: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """One episode of each actor: observations, commands and lengths, as in `animat.studies.paths.Paths`."""
     robot, n = environment.robot, len(keys)
@@ -95,7 +90,7 @@ def paths_on_host(
 
 def _wave(
     environment: Environment[Any],
-    simulator: NeuronSimulator | None,
+    simulator: Neurons,
     actors: Any,
     keys: Key[Array, " actors"],
     seeds: Sequence[tuple[int, ...]],
@@ -124,11 +119,7 @@ def _wave(
 
 
 def _iterations(
-    environment: Environment[Any],
-    simulator: NeuronSimulator | None,
-    actors: Any,
-    keys: Key[Array, " actors"],
-    bodies: Bodies,
+    environment: Environment[Any], simulator: Neurons, actors: Any, keys: Key[Array, " actors"], bodies: Bodies
 ) -> Iterator[tuple[np.ndarray, np.ndarray, StepResult]]:
     """Commands, delivered conditions and results of each iteration of begun bodies; ended episodes begin again."""
     shape = len(keys), len(bodies) // len(keys)
@@ -151,7 +142,7 @@ def _bodies(robot: HostRobot, seeds: Sequence[tuple[int, ...]]) -> Bodies:
     return bodies
 
 
-def _zeros(environment: Environment[Any], simulator: NeuronSimulator | None, shape: tuple[int, int]) -> Counts:
+def _zeros(environment: Environment[Any], simulator: Neurons, shape: tuple[int, int]) -> Counts:
     """Counts of 0, for `shape` = (actors, episodes)."""
     n = 0 if simulator is None or environment.n_actions is None else environment.n_actions
     return Counts(
@@ -171,7 +162,7 @@ def _started(environment: Environment[Any], keys: Key[Array, " actors"], episode
 @partial(jax.jit, static_argnums=0, compiler_options=COMPILER_OPTIONS)
 def _iteration(
     environment: Environment[Any],
-    simulator: NeuronSimulator | None,
+    simulator: Neurons,
     actors: Any,
     keys: Key[Array, " actors"],
     iteration: Array,

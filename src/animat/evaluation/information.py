@@ -11,11 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float64, Int
 
-from animat.environment import Environment
+from animat.environment import Environment, Neurons
 from animat.errors import InvalidArgument
 from animat.evaluation.rollouts import Actor, trace
 from animat.evaluation.statistics import CONFIDENCE, Interval
-from animat.neurons.simulator import NeuronSimulator
 from animat.robots.base import capability
 
 EPISODES = 64
@@ -49,12 +48,7 @@ class GoalInformation:
 
 
 def goal_information(
-    environment: Environment[Any],
-    simulator: NeuronSimulator | None,
-    actors: Actor,
-    *,
-    draws: int = DRAWS,
-    seed: int = 1,
+    environment: Environment[Any], simulator: Neurons, actors: Actor, *, draws: int = DRAWS, seed: int = 1
 ) -> GoalInformation:
     """How much information the chosen stimulus carries about the goal, given the sensors.
 

@@ -9,13 +9,12 @@ import numpy as np
 from jaxtyping import Float64
 
 from animat.columns import align_columns
-from animat.environment import Animat, Environment
+from animat.environment import Animat, Environment, Neurons
 from animat.errors import InvalidArgument
 from animat.evaluation.controls import Control, interventions_of
 from animat.evaluation.information import DRAWS, GoalInformation, goal_information, interval_of_mean
 from animat.evaluation.rollouts import Networks, Traces, trace
 from animat.evaluation.statistics import Interval
-from animat.neurons.simulator import NeuronSimulator
 from animat.progress import Progress, Silent
 from animat.records import as_json
 from animat.tables import briefly
@@ -112,7 +111,7 @@ class InterventionTable:
 
 def run_interventions(
     environment: Environment[Any],
-    simulator: NeuronSimulator | None,
+    simulator: Neurons,
     policies: Networks,
     *,
     episodes: int,

@@ -14,20 +14,19 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64, Int32, UInt16
 
 from animat.arguments import checked_arguments
-from animat.environment import Environment
+from animat.environment import Environment, Neurons
 from animat.errors import InvalidArgument, Mismatch
 from animat.evaluation.commands import CLASSES, class_of, commands_after, is_shuffled, memory_of, nodes_for
 from animat.evaluation.landings import Motion, Outcomes, side_by_side
 from animat.evaluation.statistics import Interval, standard_error
 from animat.evaluation.sweeping import bellman_backup, cubic, fill_row_weights, look_ahead
 from animat.neurons.history import INITIAL_HISTORY
-from animat.neurons.simulator import NeuronSimulator
 from animat.progress import Part, Progress, Silent
 from animat.recordings.findings import Finding
 from animat.robots.grid import Grid, grid_for
 from animat.wrappers import TrialCosts, net_reward, unwrapped
 
-Case = tuple[Environment[Any], NeuronSimulator | None]
+Case = tuple[Environment[Any], Neurons]
 """An environment, and the simulator in it (None without neurons)."""
 
 COARSER = 0.75
@@ -112,7 +111,7 @@ def bracket_findings(value: float, grid_error: float, monte_carlo: float, error:
 
 
 @checked_arguments
-def best_return(environment: Environment[Any], simulator: NeuronSimulator | None, **options: Any) -> Optimum:
+def best_return(environment: Environment[Any], simulator: Neurons, **options: Any) -> Optimum:
     """The optimal return in one environment; arguments, errors and method as in `best_returns`."""
     return best_returns([(environment, simulator)], **options)[0]
 

@@ -14,13 +14,13 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Float64, Int, Int64, Key, PRNGKeyArray, Shaped
 
 from animat.compilation import COMPILER_OPTIONS
-from animat.environment import Environment, State
+from animat.environment import Environment, Neurons, State
 from animat.errors import InvalidArgument, expect_at_least, shown
 from animat.evaluation.commands import mean_commands
 from animat.evaluation.host_rollouts import roll_out_on_host
 from animat.goals.robot import RobotWithGoal
 from animat.goals.tally import Outcome
-from animat.neurons.simulator import NeuronSimulator, stacked
+from animat.neurons.simulator import stacked
 from animat.robots.base import MOST_AT_ONCE, capability
 from animat.robots.host import HostRobot
 from animat.tables import briefly
@@ -125,7 +125,7 @@ class HeuristicPolicy(Actor):
         return nearest_action(self.actions, self.means, wanted)
 
 
-def heuristic_policy(environment: Environment[Any], simulator: NeuronSimulator | None) -> HeuristicPolicy:
+def heuristic_policy(environment: Environment[Any], simulator: Neurons) -> HeuristicPolicy:
     """The heuristic policy for an environment, as one actor; InvalidArgument for a robot without a `heuristic`."""
     capability(environment.robot, "heuristic")
     if environment.n_actions is None:
@@ -191,13 +191,7 @@ def networks_of(policies: Sequence[Policy], *, greedy: bool = False) -> Networks
 
 
 def roll_out(
-    environment: Environment[Any],
-    simulator: NeuronSimulator | None,
-    actors: Actor,
-    *,
-    episodes: int,
-    seed: int,
-    alike: bool = False,
+    environment: Environment[Any], simulator: Neurons, actors: Actor, *, episodes: int, seed: int, alike: bool = False
 ) -> Episodes:
     """Run episodes of several actors on one simulator.
 
@@ -224,11 +218,7 @@ def roll_out(
 
 @partial(jax.jit, static_argnums=(0, 1), compiler_options=COMPILER_OPTIONS)
 def _roll_out(
-    environment: Environment[Any],
-    episodes: int,
-    simulator: NeuronSimulator | None,
-    actors: Actor,
-    keys: Key[Array, " actors"],
+    environment: Environment[Any], episodes: int, simulator: Neurons, actors: Actor, keys: Key[Array, " actors"]
 ) -> tuple[Any, ...]:
     n_conditions = 0 if simulator is None or environment.n_actions is None else environment.n_actions
     n_drawn = environment.n_drawn
@@ -290,9 +280,7 @@ class Traces(NamedTuple):
     lengths: Int[np.ndarray, "actors episodes"]
 
 
-def trace(
-    environment: Environment[Any], simulator: NeuronSimulator | None, actors: Actor, *, episodes: int, seed: int
-) -> Traces:
+def trace(environment: Environment[Any], simulator: Neurons, actors: Actor, *, episodes: int, seed: int) -> Traces:
     """Run episodes of each actor on a robot in JAX; arguments as in `animat.evaluation.rollouts.roll_out`."""
     n_actors = actors.n_actors
     keys = jax.random.split(jax.random.key(seed), n_actors * episodes).reshape(n_actors, episodes)
@@ -301,7 +289,7 @@ def trace(
 
 
 @partial(jax.jit, static_argnums=0)
-def _trace(environment: Environment[Any], simulator: NeuronSimulator | None, actors: Actor, keys: Any) -> Traces:
+def _trace(environment: Environment[Any], simulator: Neurons, actors: Actor, keys: Any) -> Traces:
     n_drawn = environment.n_drawn
 
     def one_episode(actor: Actor, key: Any) -> Traces:

@@ -12,7 +12,7 @@ import numpy as np
 from animat.arguments import checked_arguments
 from animat.coding.electrode_pulses import electrode_pulses
 from animat.columns import align_columns
-from animat.environment import Animat, Environment, WithoutNeurons
+from animat.environment import Animat, Environment, Neurons, WithoutNeurons
 from animat.errors import InvalidArgument, Mismatch, UnusableData, counted, in_min
 from animat.evaluation import transfer
 from animat.evaluation.controls import Control, Row, controls_of, coupling_of
@@ -24,7 +24,6 @@ from animat.evaluation.rollouts import networks_of
 from animat.evaluation.statistics import Interval, Verdict, normalised_score
 from animat.goals.robot import objectives_of
 from animat.goals.tally import MEANS, cells_of, satisfaction_line
-from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import SimulatorTimeline
 from animat.progress import Part, Progress, Silent, in_phase
 from animat.recordings.findings import Finding
@@ -305,7 +304,7 @@ class _World:
 
     first: Policy
     environment: Environment[Any]
-    simulator: NeuronSimulator | None = None
+    simulator: Neurons = None
     timeline: SimulatorTimeline | None = None
     minute: float | None = None
     fixed_from_min: float | None = None

@@ -16,9 +16,8 @@ import numpy as np
 from jaxtyping import Float64
 
 from animat.compilation import jit_side_by_side
-from animat.environment import Environment
+from animat.environment import Environment, Neurons
 from animat.errors import InvalidFile, UnusableData
-from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import SimulatorTimeline
 from animat.progress import Progress
 from animat.responses.readouts import ALL
@@ -105,7 +104,7 @@ def train_groups(
     return together.split(together.policies())
 
 
-def _simulators_of(group: Group) -> Callable[[int], NeuronSimulator | None]:
+def _simulators_of(group: Group) -> Callable[[int], Neurons]:
     """The simulator of a group in each chunk, by its number; all simulators where each episode draws one."""
     training = group.training
     if group.timeline is None:
@@ -188,7 +187,7 @@ class SideBySide:
         ends = np.cumsum([len(group.members) for group in self._groups])
         return [rows[end - len(group.members) : end] for group, end in zip(self._groups, ends, strict=True)]
 
-    def train(self, index: int, *simulators: NeuronSimulator | None) -> float:
+    def train(self, index: int, *simulators: Neurons) -> float:
         """Train one chunk with the simulator of each group; `index` counts from 0, also beyond those of the training.
 
         Returns the mean return of the episodes that ended in it, NaN if none ended. Raises UnusableData if policies

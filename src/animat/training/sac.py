@@ -27,8 +27,7 @@ import optax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from animat.compilation import jit_side_by_side
-from animat.environment import Environment, State
-from animat.neurons.simulator import NeuronSimulator
+from animat.environment import Environment, Neurons, State
 from animat.robots.base import Robot
 from animat.training.exploration import Exploration, count_ended, entropy_factor, explore, n_uniforms, nothing_held
 from animat.training.networks import Network, draw_action, forward, initial_networks, squashed_normal
@@ -168,7 +167,7 @@ def train_chunk(
     environment: EpisodeLimit[Any],
     settings: SAC,
     learner: Learner,
-    simulator: NeuronSimulator | None,
+    simulator: Neurons,
     first_round: Int[Array, ""],
     last_round: Int[Array, ""],
 ) -> tuple[Learner, Finished]:

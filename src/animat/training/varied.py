@@ -17,10 +17,10 @@ import numpy as np
 from jax.errors import JAXTypeError
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from animat.environment import Environment, Responded, RobotState, State, Uniforms
+from animat.environment import Environment, Neurons, Responded, RobotState, State, Uniforms
 from animat.errors import InvalidArgument, did_you_mean, first_line
 from animat.goals.robot import RobotWithGoal, without_goal
-from animat.neurons.simulator import NeuronSimulator, Stored
+from animat.neurons.simulator import Stored
 from animat.robots.base import Robot
 from animat.training.lessons import Lesson
 from animat.wrappers import Wrapper, replace_innermost
@@ -87,10 +87,10 @@ class Varied(Wrapper[RobotState]):
     def observe(self, state: State) -> Float[Array, " observations"]:
         return self._in(state).observe(state)
 
-    def respond(self, uniforms: Uniforms, state: State, action: Array, simulator: NeuronSimulator | None) -> Responded:
+    def respond(self, uniforms: Uniforms, state: State, action: Array, simulator: Neurons) -> Responded:
         return self._in(state).respond(uniforms, state, action, self._drawn(state, simulator))
 
-    def advance(self, uniforms: Uniforms, state: State, action: Array, simulator: NeuronSimulator | None) -> State:
+    def advance(self, uniforms: Uniforms, state: State, action: Array, simulator: Neurons) -> State:
         return self._in(state).advance(uniforms, state, action, self._drawn(state, simulator))
 
     def succeeded(self, state: State) -> Bool[Array, ""]:
@@ -108,7 +108,7 @@ class Varied(Wrapper[RobotState]):
         varied = with_parameters(self.robot, values)
         return replace_innermost(self.inside, lambda inmost: dataclasses.replace(inmost, robot=varied))  # type: ignore[type-var]
 
-    def _drawn(self, state: State, simulator: NeuronSimulator | None) -> NeuronSimulator | None:
+    def _drawn(self, state: State, simulator: Neurons) -> Neurons:
         if not self.varying.recordings:
             return simulator
         row = state.info["recording"]
