@@ -22,8 +22,6 @@ from animat.robots.base import Quantity, Robot
 RobotState = TypeVar("RobotState")
 
 Uniforms = Float[Array, " noise"]
-Number = Float[Array, ""]
-Flag = Bool[Array, ""]
 Neurons: TypeAlias = NeuronSimulator | None
 """The simulator of the neurons that move a robot; None without neurons."""
 
@@ -34,8 +32,8 @@ _NOT_CARRIED = ("delivered", "rate_hz", "command")
 class Ended(NamedTuple):
     """Whether the task ended by itself (fell, reached), or the episode was cut off (`animat.wrappers.EpisodeLimit`)."""
 
-    terminated: Flag
-    truncated: Flag
+    terminated: Bool[Array, ""]
+    truncated: Bool[Array, ""]
 
 
 class Responded(NamedTuple):
@@ -62,7 +60,7 @@ class State(NamedTuple):
     robot: Any
     iteration: Int[Array, ""]
     neurons: Float[Array, "2"]
-    reward: Number
+    reward: Float[Array, ""]
     ended: Ended
     info: dict[str, Array]
 
@@ -125,7 +123,6 @@ class Environment(abc.ABC, Generic[RobotState]):
             uniforms: random numbers in [0, 1), shape (noise_size,).
             state: before the iteration; `State.carried` is enough.
             action: an index, or the commands.
-            simulator: of the neurons; None without neurons.
         """
         delivered, answer, command = self.respond(uniforms, state, action, simulator)
         robot, reward, terminated = self.robot.advance(uniforms[: self.robot.noise_size], state.robot, command)

@@ -32,7 +32,6 @@ _BETWEEN = re.compile(rf"({_QUANTITY}) (in|outside) ({_N}) \.\. ({_N}){_UNIT}")
 _BEYOND = re.compile(rf"({_QUANTITY}) (above|below) ({_N}){_UNIT}")
 _AROUND = re.compile(rf"({_QUANTITY}(?: , {_QUANTITY})*) around ({_N}(?: , {_N})*) radius ({_N}){_UNIT}")
 """The forms of a region's part, in which spaces separate words, numbers and signs; `...` is none of them."""
-_EXAMPLE = "avoid pole_angle outside -12..12 deg"
 
 
 @record
@@ -83,13 +82,13 @@ class Goal:
         return "; ".join(map(str, self.objectives))
 
 
-def read_goal(text: Any) -> Goal:
+def read_goal(text: str) -> Goal:
     """Parse a goal; `str` is the inverse. InvalidArgument names the objective that cannot be read."""
-    if not isinstance(text, str):
-        raise InvalidArgument(f"goal: expected a string such as {_EXAMPLE!r}, got {shown(text)}")
     clauses = [clause.strip() for clause in re.split("[;\n]", text) if clause.strip()]
     if not clauses:
-        raise InvalidArgument(f"goal: expected an objective, such as {_EXAMPLE!r}, got nothing")
+        raise InvalidArgument(
+            "goal: expected an objective, such as 'avoid pole_angle outside -12..12 deg', got nothing"
+        )
     objectives = []
     with within("goal"):
         for clause in clauses:

@@ -208,10 +208,8 @@ class AnimatVectorEnv(CompiledAnimats, VectorEnv[Observations, Actions, Rewards]
     an episode.
 
     Args:
-        robot: its name; set by the environment's id.
         num_envs: the number of environments.
-        render_mode: `rgb_array`, or None.
-        options: as in `AnimatEnv`, the same for all.
+        robot, render_mode, options: as in `AnimatEnv`, the same for all.
     """
 
     metadata = {  # noqa: RUF012 - Gymnasium's name and form
@@ -234,11 +232,7 @@ class AnimatVectorEnv(CompiledAnimats, VectorEnv[Observations, Actions, Rewards]
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, Any]]:
-        """Start all episodes from one seed; `options` are not used.
-
-        Raises:
-            InvalidArgument: for Gymnasium's `reset_mask`, which would start only some of them.
-        """
+        """Start all episodes from one seed; of the `options`, `reset_mask`, which would start only some, is refused."""
         if options and "reset_mask" in options:
             raise InvalidArgument("options: expected no 'reset_mask': all episodes are started together")
         super().reset(seed=seed)

@@ -59,14 +59,12 @@ class HistoryTracker:
         return HistoryState(0.0 if is_rested else before.trace, float(load), float(at_s))
 
     def after(self, came: HistoryState, condition: int, rate_hz: float, *, is_burst: bool) -> HistoryState:
-        """The state after a trial, from that at it and the response of all channels, Hz per channel.
-
-        After a burst the trace is not known.
-        """
+        """The state after a trial, from that at it and the response of all channels, Hz per channel."""
         rank = ranks_among(self.sorted_hz, np.array([rate_hz]))
         # For trials without a condition, the middle rank is as good as any.
         mean = 0.5 if condition == NO_CONDITION else float(self.mean_ranks[condition])
         (more,) = trace_increment(rank, mean, self.memory).tolist()
+        # After a burst the trace is not known.
         trace = 0.5 if is_burst else self.memory.decay * came.trace + more
         return HistoryState(float(trace), came.load + self.added, came.at_s)
 

@@ -128,10 +128,8 @@ def _expect_grid(what: str, value_grid: Callable[[], Any]) -> None:
         raise InvalidArgument(f"{what}: expected a Grid, got {shown(grid)}")
 
 
-def _expect_attributes(robot: Any) -> None:
+def _expect_attributes(robot: Robot[Any]) -> None:
     kind = type(robot).__name__
-    if not isinstance(robot, Robot):
-        raise InvalidArgument(f"robot: expected a robot or the name of one, got {shown(robot)}")
     for name, least, most in (
         ("n_commands", 1, MOST_COMMANDS),
         ("noise_size", 0, 10_000),

@@ -15,7 +15,6 @@ from animat.lazy import Array, jnp
 from animat.robots.base import Robot, capability
 
 _FINEST = 8192.0
-
 TAPS = 4
 """Nodes along an axis used to interpolate a value: cubic polynomials."""
 

@@ -33,7 +33,6 @@ _MEASURED_STEPS = 1_000
 """Random commands, in consecutive episodes, by which scales are measured."""
 _REPEATED_STEPS = 50
 _SEED = 20_260_000
-
 Scale = Annotated[Number, Field(ge=LEAST_SCALE, le=LARGEST_SCALE)]
 
 

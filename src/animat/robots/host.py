@@ -18,10 +18,8 @@ from animat.lazy import Array, jnp
 from animat.robots.base import Robot
 
 Answer = TypeVar("Answer")
-
 PATIENCE_S = 120.0
 """How long a step of all bodies may take, or making or resetting one, before it counts as hung."""
-
 LONGEST_KEPT = 20_000
 """Longest episode, in iterations, whose commands are kept so that training can continue within it."""
 

@@ -110,8 +110,10 @@ def state_of(folder: Path, *, is_done: bool) -> dict[str, Any]:
     """The state of work in a folder, with a message."""
     if is_done:
         return {"state": "ended", "message": "everything is done"}
-    locked = is_locked(folder)
-    if locked or (locked is None and time.time() - _last_change_s(folder) < _SILENT_S):
+    if (locked := is_locked(folder)) is None:
+        paths = [folder, folder / "jobs", *folder.glob("*/jobs"), *(folder / UNFINISHED).rglob("*")]
+        locked = time.time() - max(changed_s(path) or 0.0 for path in paths) < _SILENT_S
+    if locked:
         return {"state": "running", "message": ""}
     message = (
         "no program is working in the folder: the run was stopped, was killed or failed (its command then reported "
@@ -126,9 +128,3 @@ def changed_s(path: Path) -> float | None:
         return path.stat().st_mtime
     except OSError:
         return None
-
-
-def _last_change_s(folder: Path) -> float:
-    """When work in a folder last changed it, or a subfolder."""
-    paths = [folder, folder / "jobs", *folder.glob("*/jobs"), *(folder / UNFINISHED).rglob("*")]
-    return max(changed_s(path) or 0.0 for path in paths)
