@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.stats import mannwhitneyu
@@ -1114,4 +1115,4 @@ def test_the_heuristic_policy_goes_where_it_should(mapping: str) -> None:
             seen[1, 1] = 0.95  # below the goal
         actor = jax.tree.map(lambda leaf: leaf[0], rule)
         # The synthetic means rise with the frequency.
-        assert actor.act(environment, seen, np.zeros((2, 1))).tolist() == [4, 0]
+        assert actor.act(environment, jnp.asarray(seen), jnp.zeros((2, 1))).tolist() == [4, 0]
