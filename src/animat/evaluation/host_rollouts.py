@@ -17,7 +17,6 @@ from animat.robots.host import Bodies, HostRobot, StepResult
 
 AT_ONCE = 64
 """Bodies side by side: each may take megabytes, and more would not make a step cheaper."""
-
 _LAST = threading.local()
 """The bodies of a thread's last wave: creating new ones takes longer than many an episode."""
 

@@ -116,7 +116,8 @@ def with_enough_samples(responses: Responses) -> tuple[Responses, tuple[str, ...
     more, nine of ten intervals contain the true optimum, with 10 four of five (docs/evidence/optimal-return.md). Raises
     UnusableData if no condition has that many.
     """
-    n, few = _counts(responses), undersampled(responses)
+    n = [len(responses.rates_of(i)) for i in range(len(responses.conditions))]
+    few = too_few(responses.conditions, n)
     if len(few) == len(n):
         raise UnusableData(
             f"responses: expected at least {FEW_SAMPLES} non-burst ones to some condition, got at most "
@@ -127,11 +128,7 @@ def with_enough_samples(responses: Responses) -> tuple[Responses, tuple[str, ...
 
 def undersampled(responses: Responses) -> tuple[str, ...]:
     """The conditions with fewer than 30 non-burst responses, each with their number."""
-    return too_few(responses.conditions, _counts(responses))
-
-
-def _counts(responses: Responses) -> list[int]:
-    return [len(responses.rates_of(i)) for i in range(len(responses.conditions))]
+    return too_few(responses.conditions, [len(responses.rates_of(i)) for i in range(len(responses.conditions))])
 
 
 def too_few(conditions: Sequence[Condition], n: Sequence[int]) -> tuple[str, ...]:

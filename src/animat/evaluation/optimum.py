@@ -28,13 +28,10 @@ from animat.wrappers import TrialCosts, net_reward, unwrapped
 
 Case = tuple[Environment[Any], Neurons]
 """An environment, and the simulator in it (None without neurons)."""
-
 COARSER = 0.75
 """Steps along each axis of the comparison grid, as a share of those of the grid in use."""
-
 _SAME = 0.01
 """Returns that differ by less count as equal: the standard error is 0 in a deterministic environment."""
-
 _STARTS = 2**14
 """Starts over which a value is averaged: with two goals that are worth 50 more and less, to within 0.4."""
 _MOST_MIB = 16_384

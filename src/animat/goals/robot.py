@@ -24,7 +24,6 @@ from animat.robots.registry import robot_from_dict, robot_named, robot_to_dict
 
 FAILED, REACHED = 100.0, 50.0
 """Cost of failing and reward of reaching, with equal weights."""
-
 POTENTIAL = 3.0
 """Depth of the potential a whole scale or more away from a region: the pay of three iterations."""
 

@@ -16,7 +16,6 @@ from animat.responses.responses import Responses
 
 LARGEST_LOSS = 0.05
 """A difference in P(x >= P50) between data and simulator above which `findings` warns."""
-
 _evenly_drawn = jax.jit(NeuronSimulator.evenly_drawn, static_argnums=1)
 """Compiled once for all simulators of a shape."""
 

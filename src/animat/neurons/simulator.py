@@ -21,10 +21,8 @@ from animat.tables import briefly
 
 Stored: TypeAlias = Array | np.ndarray[Any, Any]
 """Arrays of a simulator: JAX's, or numpy's while it travels to another process."""
-
 LARGEST_BINS = 10_000
 """Most bins of a histogram: a draw compares with each edge, and a recording has some hundred responses."""
-
 PERCENTILES = tuple(range(0, 101, 10))
 """The percentiles of the pooled non-burst responses that a simulator carries."""
 _BELOW_ONE = float(np.nextafter(np.float32(1.0), np.float32(0.0)))

@@ -157,9 +157,7 @@ def fit_timeline(
         kind: `"histogram"` (the paper), `"empirical"` (draw a measured value) or `"memory"` (draw one measured after a
             similar history); None: `"memory"`, but `"histogram"` if stimuli were presented in blocks, which do not show
             how a culture responds after a different condition.
-        bins: of a histogram.
-        range_hz: upper end of a histogram's equally wide bins, Hz, the same for all; None: each recording's own
-            percentiles are the edges (`fit_histogram`).
+        bins, range_hz: of a histogram, the same for all recordings, as in `fit_histogram`.
 
     Raises:
         InvalidArgument: if there are no responses or the kind is unknown.

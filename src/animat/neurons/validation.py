@@ -224,7 +224,6 @@ def validate(responses: Responses, *, kind: str | None = None, seed: int = 1, re
     """Fit all kinds of simulators to the first half of a recording's responses, and score them on the second.
 
     Args:
-        responses: of one recording.
         kind: that the verdict is about; None: the one that training would use.
         seed: of the free runs and the chance levels.
         readout: which of several readouts is scored; simulators answer for all of them.

@@ -178,10 +178,8 @@ def extract_series(
 
     Args:
         recordings: of one culture; or response tables.
-        by: the rule of the conditions, or its text form (`conditions_named`); None: by frequency if it is known, by
-            place if the protocol has places.
+        by, burst_threshold: as in `extract_responses`.
         window_ms: start and end of the window after the pulse; None: the paper's, 2 to 10 ms.
-        burst_threshold: a ratio of active channels in place of Otsu's threshold; 1 keeps every response.
         allow: names of findings (`"dead-window"`) to ignore.
         readouts: groups of channels, the same electrodes in all recordings; `halves` and `quadrants` are those of the
             first one.

@@ -148,9 +148,7 @@ def inspect_recording(
     """Inspect a recording as training would use it: its contents, and what is wrong with it.
 
     Args:
-        by: the rule of the conditions, or its text form, as in `extract_responses`.
-        window_ms: start and end of the window that responses are read in, after the pulse.
-        burst_threshold: a ratio of active channels in place of Otsu's threshold; 1 keeps every response.
+        by, window_ms, burst_threshold: as in `extract_responses`.
         name: what to call it; by default the source in its provenance.
 
     Raises:

@@ -37,7 +37,6 @@ BEST = "best"
 CHECKPOINT_S = 2.0
 """Seconds of training that a kill may cost; a checkpoint of five policies is 30 MB and takes about 50 ms."""
 
-
 Rows = TypeVar("Rows", list[Policy], np.ndarray)
 Chunk: TypeAlias = Float64[np.ndarray, "policies columns"]
 """One chunk of the learning curves, one row per policy; columns as `CURVE`."""

@@ -32,7 +32,6 @@ Shadowing = bool | Literal["drawn"]
 CHUNKS = 60
 """Number of chunks in a training: the units of progress, refresh and checkpoint; a culture minute each by default."""
 
-
 T = TypeVar("T")
 
 

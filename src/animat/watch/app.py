@@ -35,12 +35,7 @@ from animat.watch.view import View
 _MOST_VIEWS = 8
 """Most views kept open."""
 _VIEWS: dict[str, type[View]] = {
-    "session": SessionView,
-    "training": TrainingView,
-    "study": StudyView,
-    "cultures": CulturesView,
-    "tuning": TuningView,
-    "recording": RecordingView,
+    view.kind: view for view in (SessionView, TrainingView, StudyView, CulturesView, TuningView, RecordingView)
 }
 _Query = Mapping[str, str]
 
