@@ -281,7 +281,7 @@ class Traces(NamedTuple):
 
 
 def trace(environment: Environment[Any], simulator: Neurons, actors: Actor, *, episodes: int, seed: int) -> Traces:
-    """Run episodes of each actor on a robot in JAX; arguments as in `animat.evaluation.rollouts.roll_out`."""
+    """Run episodes of each actor on a robot in JAX; arguments as in `roll_out`."""
     n_actors = actors.n_actors
     keys = jax.random.split(jax.random.key(seed), n_actors * episodes).reshape(n_actors, episodes)
     traced: Traces = jax.device_get(_trace(environment, simulator, actors, keys))
