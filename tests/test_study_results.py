@@ -41,7 +41,7 @@ from animat.studies.simulating import Fit
 from animat.studies.source import Source
 from animat.studies.specification import Arm, Compared, RobotSpec, Study, mapping_label
 from animat.studies.tabulating import References, Tabulate, _controls, _finite, _optimum_error, _scores
-from animat.studies.task import draw_seed
+from animat.studies.task import study_seed
 from animat.studies.training import TrainGroup
 from animat.training.policy import Policy, load_policies
 from animat.wrappers import ShuffledDelivery
@@ -255,7 +255,7 @@ def test_policies_are_evaluated_as_they_are_trained_on_the_minute_s_own_neurons(
     environment, turned = (shuffled, chosen) if delivery == "shuffled" else (chosen, shuffled)
     expected = {}
     for at_min in (0.0, 140.0):
-        seed = draw_seed(study.seed, "navigation", "control", at_min)
+        seed = study_seed(study, "navigation", "control", at_min)
         for name, answering in (("own", at_min), ("other", 140.0 - at_min)):
             ran = roll_out(environment, timeline.at(answering), networks, episodes=7, seed=seed)
             expected[name, at_min] = ran.returns

@@ -64,14 +64,10 @@ def studies_of(study: Study) -> dict[str, Study]:
     """The study of each culture by the name of its folder; empty for a study of a single culture."""
     culture = study.culture
     if culture.seeds is not None:
-        return {
-            f"culture-{seed}": replace(study, culture=replace(culture, seed=seed, seeds=None))
-            for seed in read_seeds(culture.seeds)
-        }
-    return {
-        f"culture-{Path(each).name}": replace(study, culture=replace(culture, files=(each,), folders=None))
-        for each in culture.folders or ()
-    }
+        cultures = [replace(culture, seed=seed, seeds=None) for seed in read_seeds(culture.seeds)]
+    else:
+        cultures = [replace(culture, files=(each,), folders=None) for each in culture.folders or ()]
+    return {f"culture-{each.name}": replace(study, culture=each) for each in cultures}
 
 
 def run_over_cultures(
