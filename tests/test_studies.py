@@ -432,7 +432,7 @@ def test_sources_of_the_same_name_are_distinguished(tmp_path: Path) -> None:
 @pytest.mark.oracle
 def test_the_first_recording_is_the_first_in_time_not_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """`recording_0010_min` comes before `recording_02.5_min` by name."""
-    monkeypatch.setattr("animat.studies.figures.save_figure", lambda figure, path: path)
+    monkeypatch.setattr("animat.report.style.save_figure", lambda figure, path: path)
     folder = tmp_path / "study"
     for minute, channels in ((2.5, 24), (10.0, 16)):
         made = synthetic_recording(1, patterns=20, channels=channels)

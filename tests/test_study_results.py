@@ -27,11 +27,10 @@ from animat.recordings.reading import read_recordings
 from animat.report.results import ComparedReturns, Results, Score, StudyOptimum
 from animat.responses.series import extract_series
 from animat.robots import Navigation
-from animat.studies.episodes import COLUMNS, RANDOM, episode_rows, mean_returns, read_episodes, write_episodes
+from animat.studies.episodes import COLUMNS, RANDOM, Paths, episode_rows, mean_returns, read_episodes, write_episodes
 from animat.studies.evaluating import Evaluate
 from animat.studies.figure_tables import write_paths
 from animat.studies.optima import FindOptima, read_optima
-from animat.studies.paths import Paths
 from animat.studies.pictures import _courses, _minutes_in_training
 from animat.studies.places import controls_file, episodes_file, optima_file, results_file, table_file
 from animat.studies.recording import Record

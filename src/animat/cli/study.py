@@ -40,7 +40,7 @@ def run_and_report(study: Study, base: Path, command: JobOptions) -> dict[str, A
 def _run_one(study: Study, base: Path, command: JobOptions) -> dict[str, Any]:
     from animat.columns import align_columns
     from animat.report.results import Results
-    from animat.studies.heuristic import not_outperforming
+    from animat.studies.outperforming import not_outperforming
     from animat.studies.places import results_file
     from animat.studies.results import read_typed
     from animat.studies.run import run_study

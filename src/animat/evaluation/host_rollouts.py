@@ -77,7 +77,7 @@ def paths_on_host(
     """One episode of each actor with its path; arguments as in `roll_out_on_host`.
 
     Returns:
-        Observations before each iteration and after the last, commands, lengths, as in `animat.studies.paths.Paths`.
+        Observations before each iteration and after the last, commands, lengths, as in `animat.studies.episodes.Paths`.
     """
     robot, n = environment.robot, len(keys)
     assert isinstance(robot, HostRobot)

@@ -15,7 +15,7 @@ from urllib.parse import quote
 from PIL import Image
 
 from animat.errors import as_invalid_file
-from animat.report.style import PNG_DPI
+from animat.report.style import FORMATS, PNG_DPI
 from animat.writing import write_whole
 
 MINUS = "\u2212"
@@ -73,6 +73,12 @@ class Picture:
             return png.width * 100 // PNG_DPI
 
 
+def picture_of(folder: Path, name: str, title: str, caption: str, *numbers: str, narrow: Path | None = None) -> Picture:
+    """A figure of `save_formats` on the page in this folder, with links to its formats and the files of its numbers."""
+    beside = (*(f"{name}.{ending}" for ending in FORMATS[1:]), *numbers)
+    return Picture(folder / f"{name}.{FORMATS[0]}", title, caption, beside, narrow)
+
+
 @dataclass(frozen=True)
 class Table:
     """A table of the page.
@@ -102,8 +108,8 @@ Columns: TypeAlias = list[tuple[str, "str | Callable[[Any], Any]"]]
 
 
 def columns_of(*fields: str) -> Columns:
-    """Columns named after their fields, with spaces."""
-    return [(name.replace("_", " "), name) for name in fields]
+    """Columns named after their fields, with spaces, and minutes in parentheses."""
+    return [(re.sub("_min$", " (min)", name).replace("_", " "), name) for name in fields]
 
 
 def table_of(title: str, records: Sequence[Any], columns: Columns, **more: Any) -> Table:

@@ -123,6 +123,11 @@ def save_figure(figure: Figure, path: str | os.PathLike[str]) -> Path:
     return path
 
 
+def save_formats(figure: Figure, folder: Path, name: str) -> list[Path]:
+    """Write a figure in every format, the PNG first; returns the files."""
+    return [save_figure(figure, folder / f"{name}.{ending}") for ending in FORMATS]
+
+
 def grid_of_panels(
     n: int, columns: int, width_in: float, height_in: float, title: str, *, share_x: bool = False, share_y: bool = False
 ) -> tuple[Figure, list[Axes]]:

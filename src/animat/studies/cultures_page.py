@@ -5,12 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 from animat.errors import counted
-from animat.report.html import Section, cell, columns_of, table_of, write_page
+from animat.report.html import Section, cell, columns_of, picture_of, table_of, write_page
 from animat.report.over_cultures import draw_over_cultures
 from animat.report.results import OverCultures
+from animat.report.style import save_formats
 from animat.studies.arms import arm_differences, arms_table, summarise_arms
 from animat.studies.cultures import COMPARISONS, SUMMARY, CulturesRun
-from animat.studies.figures import picture_of, save_formats
 from animat.studies.places import REPORT
 from animat.studies.specification import Compared, Study
 from animat.studies.tabulating import LEVEL

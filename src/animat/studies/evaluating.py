@@ -14,8 +14,7 @@ from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import SimulatorTimeline, load_timeline
 from animat.progress import Progress
 from animat.robots.host import HostRobot
-from animat.studies.episodes import COUPLING, RANDOM, episode_rows, write_episodes
-from animat.studies.paths import record_paths
+from animat.studies.episodes import COUPLING, RANDOM, episode_rows, record_paths, write_episodes
 from animat.studies.places import TIMELINE, controls_file, episodes_file, paths_file, policies_folder
 from animat.studies.results import write_arrays
 from animat.studies.specification import Arm, RobotSpec, Study, mapping_label

@@ -16,7 +16,7 @@ from animat.report.learning_curves import LearningCurve, mean_with_interval
 from animat.report.over_time import Courses, quartiles
 from animat.responses.psth import PostStimulusHistogram
 from animat.responses.responses import Responses
-from animat.studies.paths import Paths
+from animat.studies.episodes import Paths
 from animat.studies.places import table_file
 from animat.studies.results import write_table
 from animat.tables import UNKNOWN

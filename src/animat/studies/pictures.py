@@ -28,15 +28,13 @@ from animat.report.raster import draw_raster
 from animat.report.response_histograms import draw_response_histograms
 from animat.report.responses_over_time import draw_responses_over_time
 from animat.report.results import ComparedReturns, ControlReturns, Results
-from animat.report.style import Figure
+from animat.report.style import Figure, save_formats
 from animat.responses.psth import post_stimulus_histogram, spontaneous_rate
 from animat.robots.base import lacking
 from animat.studies import figure_tables
-from animat.studies.episodes import POLICY, mean_returns, rows_where
+from animat.studies.episodes import POLICY, Paths, mean_returns, rows_where
 from animat.studies.evaluating import as_recorded
-from animat.studies.figures import save_formats
 from animat.studies.optima import kinds_of
-from animat.studies.paths import Paths
 from animat.studies.places import RECORDINGS, paths_file, results_file
 from animat.studies.results import read_arrays, read_typed
 from animat.studies.simulating import read_series

@@ -18,22 +18,19 @@ from animat.neurons.fidelity import Fidelity
 from animat.neurons.timeline import load_timeline
 from animat.progress import Progress
 from animat.report.headline import draw_headline
-from animat.report.html import Picture, Section, Table, cell, write_page
+from animat.report.html import Picture, Section, Table, cell, picture_of, write_page
 from animat.report.results import ComparedReturns, ControlReturns, Results, Score
-from animat.report.style import save_figure
+from animat.report.style import save_figure, save_formats
 from animat.responses.responses import Responses
 from animat.studies import report_tables
 from animat.studies.arms import arm_differences, arms_table, describe_mapping, summarise_arms
 from animat.studies.captions import BURSTS, CULTURE, HEADLINE, NO_BURSTS, ROBOT, Caption
 from animat.studies.differences import decisions, differing_comparisons
 from animat.studies.episodes import DataFrame
-from animat.studies.figures import picture_of, save_formats
 from animat.studies.folder import MANIFEST
-from animat.studies.goals import goals_table
-from animat.studies.heuristic import not_outperforming
+from animat.studies.outperforming import describe_reflexes, not_outperforming
 from animat.studies.pictures import round_of
 from animat.studies.places import REPORT, TIMELINE, results_file
-from animat.studies.reflex import describe_reflexes
 from animat.studies.results import read_typed
 from animat.studies.simulating import controllability, read_series
 from animat.studies.specification import Arm, Study
@@ -236,7 +233,7 @@ def _scores(results: Results) -> Section:
     note = (
         "Means over policies; the interquartile mean is that of the middle half, with its 95 % interval by Student's t."
     )
-    goals = (goals_table(results.goals),) if results.goals else ()
+    goals = (report_tables.goals_table(results.goals),) if results.goals else ()
     optima = report_tables.optima_table(results.optima)
     return Section("Scores", (note,), tables=(report_tables.scores_table(results.scores), optima, *goals))
 

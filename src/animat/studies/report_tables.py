@@ -12,13 +12,14 @@ from animat.report.results import (
     ComparedReturns,
     ControlReturns,
     HeuristicComparison,
+    ObjectiveMet,
     ReflexComparison,
     Score,
     StudyOptimum,
 )
 from animat.responses.quality.responses import FEW_SAMPLES
-from animat.studies.heuristic import NOT
 from animat.studies.optima import complete_optima, key_of, kinds_over_time, read_optima
+from animat.studies.outperforming import NOT
 from animat.studies.specification import Study, mapping_label
 from animat.studies.tabulating import FIRST, LEVEL, SECOND
 
@@ -36,9 +37,7 @@ _SCORE_NOTE = (
 def comparisons_table(rows: Sequence[ComparedReturns]) -> Table:
     """Tests and outcomes, with the paper's p where it printed one."""
     columns: Columns = [
-        *columns_of("comparison", "robot"),
-        ("at (min)", "at_min"),
-        ("n", "n"),
+        *columns_of("comparison", "robot", "at_min", "n"),
         ("U", "u"),
         ("p", "p_normal"),
         ("p exact", "p_exact"),
@@ -77,9 +76,7 @@ def scores_table(rows: Sequence[Score]) -> Table:
         "Every arm",
         rows,
         [
-            *columns_of("robot", "arm"),
-            ("at (min)", "at_min"),
-            *columns_of("policies", "episodes"),
+            *columns_of("robot", "arm", "at_min", "policies", "episodes"),
             ("mean", "mean_return"),
             ("s.d.", "standard_deviation"),
             ("interquartile mean", _interval("interquartile_mean", "low_95", "high_95")),
@@ -96,7 +93,7 @@ def optima_table(optima: Sequence[StudyOptimum]) -> Table:
     columns: Columns = [
         ("robot", "robot"),
         ("mapping", lambda row: mapping_label(row.mapping, row.percentiles)),
-        ("at (min)", "at_min"),
+        *columns_of("at_min"),
         ("optimum ± grid", _pair("best_return", "grid_error")),
         ("95 % interval", lambda row: None if row.low_95 is None else _ends(row.low_95, row.high_95)),
         ("its controller, run", _pair("monte_carlo", "standard_error")),
@@ -189,14 +186,30 @@ def controls_table(study: Study, rows: Sequence[ControlReturns]) -> Table:
     )
 
 
+def goals_table(rows: Sequence[ObjectiveMet]) -> Table:
+    """One row for each objective, arm and control."""
+    return table_of(
+        "Goals",
+        rows,
+        [
+            *columns_of("robot", "arm", "agent", "at_min", "episodes"),
+            ("success", "success_share"),
+            *columns_of("margin", "objective"),
+            ("satisfied (%)", "satisfaction"),
+        ],
+        note="Means over all episodes. Success: share of episodes. Margin: how far an episode was from failing its "
+        "goal, or from meeting it, in scales of the quantities: above 0 if it succeeded, and the larger the better.",
+        beside="tables/goals.csv",
+    )
+
+
 def heuristic_table(rows: Sequence[HeuristicComparison]) -> Table:
     """Trained policies and the heuristic policy, compared over episodes."""
     return table_of(
         "Policies and the heuristic policy",
         rows,
         [
-            *columns_of("robot", "arm"),
-            ("at (min)", "at_min"),
+            *columns_of("robot", "arm", "at_min"),
             ("policies", "mean_return"),
             *columns_of("heuristic", "p"),
             ("pairs won", "wins"),
@@ -215,8 +228,7 @@ def reflexes_table(rows: Sequence[ReflexComparison]) -> Table:
         "Policies and the best reflex",
         rows,
         [
-            *columns_of("robot", "arm"),
-            ("at (min)", "at_min"),
+            *columns_of("robot", "arm", "at_min"),
             ("best coupling", _pair("coupling", "coupling_standard_error")),
             ("optimum", "optimum"),
             ("context gap", _interval("gap", "gap_low_95", "gap_high_95")),
