@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from animat.cli.jobs import JobOptions
+from animat.cli.command import JobOptions
 from animat.cli.study import run_and_report
 from animat.errors import InvalidArgument
 
@@ -44,9 +44,8 @@ class Reproduce(JobOptions):
 
     def _context(self, cultures: list[int]) -> dict[str, Any]:
         """Run the context study."""
-        from animat.studies.context import run_context_study
+        from animat.studies.context import ContextStudy, quick_context_study, run_context_study
         from animat.studies.context_page import summarise_robot, write_context_page
-        from animat.studies.context_tasks import ContextStudy, quick_context_study
 
         study = (quick_context_study if self.quick else ContextStudy)(cultures=tuple(cultures), seed=self.seed)
         with self.executing("study") as execution:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from tyro.conf import Positional
 
-from animat.cli.jobs import JobOptions
+from animat.cli.command import JobOptions
 
 if TYPE_CHECKING:
     from animat.studies.specification import Study

@@ -9,7 +9,7 @@ from typing import Any
 
 from tyro.conf import Positional
 
-from animat.cli.jobs import JobOptions
+from animat.cli.command import JobOptions
 from animat.errors import counted
 
 

@@ -12,8 +12,7 @@ from animat.report.context import draw_context, draw_whose_work
 from animat.report.html import Columns, Section, Table, cell, columns_of, picture_of, table_of, write_page
 from animat.report.results import ContextRow, LostRow
 from animat.report.style import save_formats
-from animat.studies.context import TABLE, WHOSE_WORK, ContextRun
-from animat.studies.context_tasks import ContextStudy
+from animat.studies.context import TABLE, WHOSE_WORK, ContextRun, ContextStudy
 from animat.studies.places import REPORT
 
 
