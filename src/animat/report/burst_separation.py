@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from animat.errors import counted
+from animat.lazy import Axes, Figure
 from animat.report.response_histograms import even_edges, rate_edges
-from animat.report.style import BLACK, BLUE, BURST, NON_BURST, Axes, Figure, add_legend, new_figure, style_axes
+from animat.report.style import BLACK, BLUE, BURST, NON_BURST, add_legend, new_figure, style_axes
 from animat.responses.responses import Responses
 
 _RATE = "response x (Hz per channel)"

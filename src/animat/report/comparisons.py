@@ -9,21 +9,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float64
 
+from animat.lazy import Axes, Figure
 from animat.report.html import cell, with_minus
 from animat.report.results import ComparedReturns
-from animat.report.style import (
-    BLACK,
-    BLUE,
-    GREY,
-    OPTIMUM,
-    ORANGE,
-    Axes,
-    Figure,
-    add_common_legend,
-    new_figure,
-    style_axes,
-    title_figure,
-)
+from animat.report.style import BLACK, BLUE, GREY, OPTIMUM, ORANGE, add_common_legend, new_figure, style_axes
 
 _NAME_WIDTH = 14
 """Characters per line of an arm's name, as two stand side by side under a panel."""
@@ -49,8 +38,7 @@ def draw_comparisons(pairs: Sequence[Pair], title: str) -> Figure:
     Boxes reach from the first to the third quartile with the median, whiskers to 1.5 times that range; points are
     policies. `pairs` has at least one comparison, all on one robot.
     """
-    figure = new_figure(max(2.7 * len(pairs), 4.5), 6.4)
-    title_figure(figure, title)
+    figure = new_figure(max(2.7 * len(pairs), 4.5), 6.4, title)
     rows = figure.subplots(2, len(pairs), squeeze=False, height_ratios=[1.0, 0.9])
     for whole, close, pair in zip(*rows, pairs, strict=True):
         row = pair.row

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from textwrap import fill
 
+from animat.lazy import Figure
 from animat.report.html import with_minus
 from animat.report.results import TRAINED, ControlReturns
-from animat.report.style import BLUE, GREY, OPTIMUM, ORANGE, Figure, add_common_legend, grid_of_panels, style_axes
+from animat.report.style import BLUE, GREY, OPTIMUM, ORANGE, add_common_legend, grid_of_panels, style_axes
 
 _TITLE_WIDTH = 36
 """Characters per line of a panel's title."""

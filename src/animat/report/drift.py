@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-from animat.report.style import BLACK, BURST, GREY, Figure, add_legend, condition_colours, new_figure, style_axes
+from animat.lazy import Figure
+from animat.report.style import BLACK, BURST, GREY, add_legend, condition_colours, new_figure, style_axes
 from animat.responses.responses import Responses
 
 PERCENTILES = (10, 25, 50, 75, 90)

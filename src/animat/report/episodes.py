@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from animat.report.style import Figure, grid_of_panels, new_figure, style_axes, title_figure, wrapped
+from animat.lazy import Figure
+from animat.report.style import grid_of_panels, new_figure, style_axes, wrapped
 from animat.robots.base import Robot, capability
 from animat.robots.drawing import draw_robot
 
@@ -38,8 +39,7 @@ def draw_frames(robot: Robot[Any], episodes: Mapping[str, tuple[Path, Sequence[f
     """
     first = draw_robot(robot, next(iter(episodes.values()))[0][0])
     wide = first.shape[1] / first.shape[0]
-    figure = new_figure(9.5, 0.6 + len(episodes) * (9.5 / _FRAMES / wide + 0.28))
-    title_figure(figure, title)
+    figure = new_figure(9.5, 0.6 + len(episodes) * (9.5 / _FRAMES / wide + 0.28), title)
     rows = figure.subplots(len(episodes), _FRAMES, squeeze=False)
     for axes_row, (name, (path, commands)) in zip(rows, episodes.items(), strict=True):
         for axes, i in zip(axes_row, np.linspace(0, len(path) - 1, _FRAMES).round().astype(int), strict=True):

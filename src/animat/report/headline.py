@@ -8,19 +8,9 @@ from textwrap import fill
 import numpy as np
 from jaxtyping import Float64
 
+from animat.lazy import Figure
 from animat.report.results import Score
-from animat.report.style import (
-    BLUE,
-    GREY,
-    NAME_WIDTH,
-    OPTIMUM,
-    SKY,
-    Figure,
-    add_common_legend,
-    new_figure,
-    style_axes,
-    wrapped,
-)
+from animat.report.style import BLUE, GREY, NAME_WIDTH, OPTIMUM, SKY, add_common_legend, new_figure, style_axes, wrapped
 
 
 def draw_headline(rows: Sequence[tuple[Score, Float64[np.ndarray, " policies"]]], *, narrow: bool = False) -> Figure:
@@ -29,15 +19,14 @@ def draw_headline(rows: Sequence[tuple[Score, Float64[np.ndarray, " policies"]]]
     The axis covers all returns; an interval that extends beyond it ends in an arrow. A narrow figure is as wide as a
     phone, with the panels below each other. Each score comes with the mean return of each policy.
     """
-    robots = list(dict.fromkeys(row.robot for row, _ in rows))
-    most = max(sum(row.robot == robot for row, _ in rows) for robot in robots)
+    robots = dict.fromkeys(row.robot for row, _ in rows)
+    by_robot = {robot: [each for each in rows if each[0].robot == robot] for robot in robots}
     names = {row.arm: fill(row.arm, NAME_WIDTH) for row, _ in rows}
     lines = max(name.count("\n") + 1 for name in names.values())
-    height_in, n = 1.2 + max(0.34, 0.18 * lines) * most, len(robots)
+    height_in, n = 1.2 + max(0.34, 0.18 * lines) * max(map(len, by_robot.values())), len(by_robot)
     figure = new_figure(3.6, height_in * n) if narrow else new_figure(4.6 * n, height_in)
     panels = list(figure.subplots(*((n, 1) if narrow else (1, n)), squeeze=False).flat)
-    for axes, robot in zip(panels, robots, strict=True):
-        own = [each for each in rows if each[0].robot == robot]
+    for axes, (robot, own) in zip(panels, by_robot.items(), strict=True):
         style_axes(axes, wrapped(robot, 2.0), "mean return of an episode", "")
         every = [(row.interquartile_mean, row.random, row.optimum, *policies.tolist()) for row, policies in own]
         known = [value for of_arm in every for value in of_arm if value is not None]

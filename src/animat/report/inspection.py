@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from animat.errors import InvalidArgument, Mismatch, counted
+from animat.lazy import Figure
 from animat.recordings.findings import Finding
 from animat.recordings.recording import Recording
 from animat.recordings.response_table import ResponseTable
@@ -16,9 +17,8 @@ from animat.report.burst_separation import draw_burst_separation
 from animat.report.drift import draw_drift
 from animat.report.psth import draw_psth
 from animat.report.raster import draw_raster, draw_spontaneous
-from animat.report.response_histograms import draw_response_histograms
-from animat.report.responses_over_time import draw_responses_over_time
-from animat.report.style import Figure, save_figure
+from animat.report.response_histograms import draw_response_histograms, draw_responses_over_time
+from animat.report.style import save_figure
 from animat.responses.inspection import Inspection
 from animat.responses.network_bursts import BIN_S, NetworkBursts
 from animat.responses.psth import PostStimulusHistogram, post_stimulus_histogram

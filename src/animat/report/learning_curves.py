@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-from animat.report.style import BLUE, GREY, OPTIMUM, Figure, add_common_legend, grid_of_panels, style_axes, wrapped
+from animat.lazy import Figure
+from animat.report.style import BLUE, GREY, OPTIMUM, add_common_legend, grid_of_panels, style_axes, wrapped
 
 _RESAMPLES = 2000
 _WIDE_IN = 3.1

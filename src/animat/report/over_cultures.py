@@ -5,18 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from textwrap import fill
 
+from animat.lazy import Figure
 from animat.report.results import OverCultures
-from animat.report.style import (
-    BLACK,
-    BLUE,
-    GREY,
-    NAME_WIDTH,
-    Figure,
-    add_common_legend,
-    new_figure,
-    style_axes,
-    wrapped,
-)
+from animat.report.style import BLACK, BLUE, GREY, NAME_WIDTH, add_common_legend, new_figure, style_axes, wrapped
 
 
 def draw_over_cultures(rows: Sequence[tuple[OverCultures, Sequence[float]]]) -> Figure:
@@ -24,12 +15,11 @@ def draw_over_cultures(rows: Sequence[tuple[OverCultures, Sequence[float]]]) -> 
 
     Each comparison comes with its difference on every culture, second arm minus first.
     """
-    robots = list(dict.fromkeys(row.robot for row, _ in rows))
-    most = max(sum(row.robot == robot for row, _ in rows) for robot in robots)
-    figure = new_figure(4.4 * len(robots), 1.5 + 0.5 * most)
-    panels = figure.subplots(1, len(robots), squeeze=False)[0]
-    for axes, robot in zip(panels, robots, strict=True):
-        own = [each for each in rows if each[0].robot == robot]
+    robots = dict.fromkeys(row.robot for row, _ in rows)
+    by_robot = {robot: [each for each in rows if each[0].robot == robot] for robot in robots}
+    figure = new_figure(4.4 * len(by_robot), 1.5 + 0.5 * max(map(len, by_robot.values())))
+    panels = figure.subplots(1, len(by_robot), squeeze=False)[0]
+    for axes, (robot, own) in zip(panels, by_robot.items(), strict=True):
         style_axes(axes, wrapped(robot, 2.0), "difference of the mean returns,\nsecond arm minus first", "")
         axes.axvline(0, color=GREY, linewidth=0.8)
         for place, (row, differences) in enumerate(own):

@@ -8,7 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float64
 
-from animat.report.style import GREY, OPTIMUM, PALETTE, Figure, add_common_legend, grid_of_panels, style_axes, wrapped
+from animat.lazy import Figure
+from animat.report.style import GREY, OPTIMUM, PALETTE, add_common_legend, grid_of_panels, style_axes, wrapped
 
 _WIDE_IN = 4.6
 """Width of a panel."""

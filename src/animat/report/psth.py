@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from animat.errors import counted
-from animat.report.style import BLUE, GREY, RED, WINDOW, Figure, add_legend, new_figure, style_axes
+from animat.lazy import Figure
+from animat.report.style import BLUE, GREY, RED, WINDOW, add_legend, new_figure, style_axes
 from animat.responses.psth import PostStimulusHistogram
 
 _ARTEFACT_MS = 5.0

@@ -8,14 +8,13 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from animat.errors import counted
+from animat.lazy import Axes, Figure
 from animat.recordings.recording import Recording
 from animat.report.style import (
     BLACK,
     BLUE,
     RED,
     WINDOW,
-    Axes,
-    Figure,
     add_common_legend,
     add_legend,
     condition_colours,

@@ -11,6 +11,7 @@ from typing import final
 
 import numpy as np
 
+from animat.lazy import Figure
 from animat.neurons.timeline import SimulatorTimeline
 from animat.progress import Progress
 from animat.recordings.reading import read_recordings
@@ -25,10 +26,9 @@ from animat.report.learning_curves import LearningCurve, draw_learning_curves, o
 from animat.report.over_time import Courses, draw_over_time
 from animat.report.psth import draw_psth
 from animat.report.raster import draw_raster
-from animat.report.response_histograms import draw_response_histograms
-from animat.report.responses_over_time import draw_responses_over_time
+from animat.report.response_histograms import draw_response_histograms, draw_responses_over_time
 from animat.report.results import ComparedReturns, ControlReturns, Results
-from animat.report.style import Figure, save_formats
+from animat.report.style import save_formats
 from animat.responses.psth import post_stimulus_histogram, spontaneous_rate
 from animat.robots.base import lacking
 from animat.studies import figure_tables
