@@ -29,8 +29,7 @@ from animat.report.style import save_figure
 from animat.robots import Cartpole
 from animat.studies.arms import arm_differences, arms_table
 from animat.studies.captions import CULTURE, HEADLINE, ROBOT
-from animat.studies.cultures import CulturesRun
-from animat.studies.cultures_page import _describe, _summary
+from animat.studies.cultures import CulturesRun, _describe, _summary
 from animat.studies.differences import decisions, differing_comparisons, explain
 from animat.studies.optima import kinds_of, kinds_over_time
 from animat.studies.paper import paper_study

@@ -25,8 +25,14 @@ from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch, U
 from animat.evaluation.statistics import compare
 from animat.report.results import ComparedReturns, Results, Score
 from animat.studies import cultures
-from animat.studies.cultures import CulturesRun, bootstrap_interval, over_cultures, run_over_cultures, studies_of
-from animat.studies.cultures_page import write_cultures_page
+from animat.studies.cultures import (
+    CulturesRun,
+    bootstrap_interval,
+    over_cultures,
+    run_over_cultures,
+    studies_of,
+    write_cultures_page,
+)
 from animat.studies.places import results_file
 from animat.studies.results import write_typed
 from animat.studies.run import StudyRun, run_study

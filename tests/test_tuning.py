@@ -34,9 +34,9 @@ from animat.training.policy import CURVE
 from animat.training.settings import SAC
 from animat.training.specification import CHUNKS, Training
 from animat.tuning import tasks
-from animat.tuning.journal import JOURNAL, TrialResult, read_journal
 from animat.tuning.results import BEST, HISTORY, RESULTS, Final, TuningResult, write_results
 from animat.tuning.run import tune
+from animat.tuning.search import JOURNAL, TrialResult, read_journal
 from animat.tuning.side_by_side import Trials
 from animat.tuning.space import Range, first_settings, with_settings
 from animat.tuning.specification import Tuning, read_tuning, tuning_of

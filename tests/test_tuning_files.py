@@ -11,7 +11,7 @@ import pytest
 from animat.cli import main
 from animat.errors import InvalidFile
 from animat.training.specification import CHUNKS
-from animat.tuning.journal import JOURNAL, read_journal
+from animat.tuning.search import JOURNAL, read_journal
 from animat.tuning.space import Range, own_settings, with_settings
 from animat.tuning.specification import Tune, read_tuning
 

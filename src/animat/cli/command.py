@@ -1,21 +1,22 @@
-"""What commands share: how they are run, options of those that run jobs or stimulate a culture, and what ends these."""
+"""What commands share: how they are run, the options of several, and how these are read and what ends a session."""
 
 from __future__ import annotations
 
 import abc
 import os
 import sys
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-from animat.errors import InvalidFile, LoopEnded, expect_at_least
+from animat.errors import InvalidArgument, InvalidFile, LoopEnded, did_you_mean, expect_at_least, within
 
 if TYPE_CHECKING:
     from animat.closed_loop.session import Session
     from animat.studies.specification import RobotSpec
+    from animat.training.settings import SAC
 
 
 @dataclass(frozen=True)
@@ -69,10 +70,13 @@ class JobOptions(FolderCommand):
     @contextmanager
     def executing(self, title: str) -> Iterator[dict[str, Any]]:
         """Arguments for what runs the jobs: workers, the executor of a cluster if one is given, and a progress bar."""
-        from animat.execution.cluster import on_cluster
+        from animat.execution.cluster import Cluster
         from animat.progress import Bar
 
-        with on_cluster(self.cluster, self.shared_folder) as executor, Bar(title) as progress:
+        if self.cluster is None and not self.shared_folder:
+            raise InvalidArgument("--no-shared-folder: expected only with --cluster, got no cluster")
+        cluster = None if self.cluster is None else Cluster(self.cluster, has_shared_folder=self.shared_folder)
+        with cluster or nullcontext() as executor, Bar(title) as progress:
             yield {"workers": self.workers, "executor": executor, "progress": progress}
 
 
@@ -124,3 +128,30 @@ def expect_no_fault(session: Session, folder: Path) -> None:
         raise LoopEnded(f"{folder}: the session ended before its plan was completed: {ending.message}")
     if not session.recording_file.is_file():
         raise InvalidFile(ending.message)
+
+
+def read_numbers(option: str, pairs: Sequence[str]) -> dict[str, float]:
+    """Read `NAME=NUMBER` pairs, each name once (else InvalidArgument); whole numbers stay whole."""
+    numbers: dict[str, float] = {}
+    for pair in pairs:
+        name, _, value = pair.partition("=")
+        if name in numbers:
+            raise InvalidArgument(f"{option}: expected {name} once, got it twice")
+        try:
+            numbers[name] = int(value) if value.lstrip("-").isdecimal() else float(value)
+        except ValueError:
+            raise InvalidArgument(f"{option}: expected NAME=NUMBER, got {pair!r}") from None
+    return numbers
+
+
+def read_sac(pairs: Sequence[str]) -> SAC:
+    """The algorithm's settings, with `pairs` in place of its defaults; InvalidArgument for an impossible one."""
+    from animat.training.settings import SAC
+
+    numbers, known = read_numbers("--sac", pairs), [field.name for field in fields(SAC)]
+    for name in numbers:
+        if name not in known:
+            near = did_you_mean(name, known)
+            raise InvalidArgument(f"--sac: {name}: no such setting; expected some of {', '.join(known)}{near}")
+    with within("--sac"):
+        return SAC(**numbers)  # type: ignore[arg-type]

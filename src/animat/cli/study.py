@@ -75,8 +75,7 @@ def _run_one(study: Study, base: Path, command: JobOptions) -> dict[str, Any]:
 def _run_many(study: Study, base: Path, command: JobOptions) -> dict[str, Any]:
     from animat.columns import align_columns
     from animat.errors import AnimatError, counted
-    from animat.studies.cultures import run_over_cultures
-    from animat.studies.cultures_page import write_cultures_page
+    from animat.studies.cultures import run_over_cultures, write_cultures_page
     from animat.studies.results import MISSING
 
     began = time.monotonic()

@@ -31,9 +31,6 @@ _SAVING: dict[Any, Any] = {"svg.fonttype": "none", "svg.hashsalt": "animat"}
 _SAVING_LOCK = threading.Lock()
 """matplotlib's settings are those of all threads, such as the workers of an executor."""
 
-NAME_WIDTH = 28
-"""Characters per line of a name beside a panel, of which there are two in a row."""
-
 
 def new_figure(width_in: float, height_in: float, title: str = "") -> Figure:
     """An empty figure of a size in inches; it needs no display and changes no global state.

@@ -14,8 +14,7 @@ from animat.report.style import save_figure
 from animat.report.tuning import draw_history, draw_importance
 from animat.studies.places import RECORDINGS
 from animat.studies.toml import study_to_toml
-from animat.tuning.journal import TrialResult
-from animat.tuning.search import importance_of
+from animat.tuning.search import TrialResult, importance_of
 from animat.tuning.space import SEARCHABLE, THROUGH_NEURONS, Settings, with_settings
 from animat.tuning.specification import Tuning
 from animat.writing import write_whole

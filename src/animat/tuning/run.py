@@ -27,9 +27,8 @@ from animat.studies.run import check_custom
 from animat.studies.task import draw_seed
 from animat.training.group import split_groups
 from animat.training.specification import CHUNKS
-from animat.tuning.journal import TrialResult, read_journal, write_journal
 from animat.tuning.results import Final, TuningResult, write_results
-from animat.tuning.search import Search, expect_optuna
+from animat.tuning.search import Search, TrialResult, expect_optuna, read_journal, write_journal
 from animat.tuning.space import choices_of, first_settings, with_settings
 from animat.tuning.specification import Tuning
 from animat.tuning.tasks import Fit, TrainTrials, Trial, group_by_shape, returns_file, timeline_file
