@@ -41,14 +41,14 @@ def _run_one(study: Study, base: Path, command: JobOptions) -> dict[str, Any]:
     from animat.columns import align_columns
     from animat.report.results import Results
     from animat.studies.outperforming import not_outperforming
-    from animat.studies.places import results_file
+    from animat.studies.places import RESULTS
     from animat.studies.results import read_typed
     from animat.studies.run import run_study
 
     began = time.monotonic()
     with command.executing("study") as execution:
         ran = run_study(study, command.out, base=base, **execution)
-    results = read_typed(results_file(ran.folder), Results)
+    results = read_typed(ran.folder / RESULTS, Results)
     cells = []
     for row in results.comparisons:
         paper = "" if row.paper_p is None else f"; the paper's p {row.paper_p:.3g}, which implies U {row.paper_u:g}"

@@ -15,9 +15,8 @@ from animat.recordings.response_table import ResponseTable
 from animat.report.array import draw_array
 from animat.report.burst_separation import draw_burst_separation
 from animat.report.drift import draw_drift
-from animat.report.psth import draw_psth
-from animat.report.raster import draw_raster, draw_spontaneous
 from animat.report.response_histograms import draw_response_histograms, draw_responses_over_time
+from animat.report.spikes import draw_psth, draw_raster, draw_spontaneous
 from animat.report.style import save_figure
 from animat.responses.inspection import Inspection
 from animat.responses.network_bursts import BIN_S, NetworkBursts

@@ -27,7 +27,7 @@ from animat.report.html import Section, cell, columns_of, picture_of, table_of, 
 from animat.report.results import ComparedReturns, OverCultures, Results, Score
 from animat.report.style import save_formats
 from animat.studies.arms import arm_differences, arms_table, summarise_arms
-from animat.studies.places import REPORT, results_file
+from animat.studies.places import REPORT, RESULTS
 from animat.studies.results import read_typed, write_named_records, write_parquet, write_records
 from animat.studies.run import StudyRun, run_study
 from animat.studies.source import read_seeds
@@ -129,7 +129,7 @@ def _write_tables(folder: Path, finished: dict[str, StudyRun], failed: dict[str,
     """Write the tables over the finished cultures."""
     if not finished:
         raise AnimatError("; ".join(f"{name}: {error}" for name, error in failed.items()))
-    results = {name: read_typed(results_file(each.folder), Results) for name, each in finished.items()}
+    results = {name: read_typed(each.folder / RESULTS, Results) for name, each in finished.items()}
     comparisons = {name: each.comparisons for name, each in results.items()}
     summary = over_cultures(list(comparisons.values()))
     scores = {name: each.scores for name, each in results.items()}

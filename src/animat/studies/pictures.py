@@ -24,10 +24,9 @@ from animat.report.drift import draw_drift, drift_of
 from animat.report.episodes import draw_frames, draw_paths
 from animat.report.learning_curves import LearningCurve, draw_learning_curves, over_rounds
 from animat.report.over_time import Courses, draw_over_time
-from animat.report.psth import draw_psth
-from animat.report.raster import draw_raster
 from animat.report.response_histograms import draw_response_histograms, draw_responses_over_time
 from animat.report.results import ComparedReturns, ControlReturns, Results
+from animat.report.spikes import draw_psth, draw_raster
 from animat.report.style import save_formats
 from animat.responses.psth import post_stimulus_histogram, spontaneous_rate
 from animat.robots.base import lacking
@@ -35,7 +34,7 @@ from animat.studies import figure_tables
 from animat.studies.episodes import POLICY, Paths, mean_returns, rows_where
 from animat.studies.evaluating import as_recorded
 from animat.studies.optima import kinds_of
-from animat.studies.places import RECORDINGS, paths_file, results_file
+from animat.studies.places import RECORDINGS, RESULTS, paths_file
 from animat.studies.results import read_arrays, read_typed
 from animat.studies.simulating import read_series
 from animat.studies.specification import Arm, RobotSpec, Study, mapping_label
@@ -96,7 +95,7 @@ class RobotPictures(StudyTask):
         study, timeline, *_ = as_recorded(self.study, folder)
         table = all_episodes(study, folder, [self.spec])
         known = References(study, folder, self.spec, table)
-        results = read_typed(results_file(folder), Results)
+        results = read_typed(folder / RESULTS, Results)
         # For every recording, with the optimum on a coarse grid.
         coarse = References(study, folder, self.spec, table, over_time=True) if study.needs_neurons else known
         figures: dict[str, Figure] = {}

@@ -10,6 +10,7 @@ from animat.studies.specification import Arm, RobotSpec
 RECORDINGS = "recordings"
 TIMELINE = "simulators/timeline.safetensors"
 RESPONSES = "simulators/responses.csv"
+RESULTS = "tables/results.json"
 REPORT = "report.html"
 RECEIPTS = "jobs"
 OWN_FOLDERS = (
@@ -41,11 +42,6 @@ def controls_file(folder: Path, spec: RobotSpec, arm: Arm) -> Path:
 def optima_file(folder: Path, robot: str, what: str = "optima") -> Path:
     """The optimal returns on a robot."""
     return folder / "optima" / f"{robot}-{what}.json"
-
-
-def results_file(folder: Path) -> Path:
-    """All results as typed records."""
-    return folder / "tables" / "results.json"
 
 
 def table_file(folder: Path, name: str) -> Path:

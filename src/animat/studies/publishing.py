@@ -30,7 +30,7 @@ from animat.studies.episodes import DataFrame
 from animat.studies.folder import MANIFEST
 from animat.studies.outperforming import describe_reflexes, not_outperforming
 from animat.studies.pictures import round_of
-from animat.studies.places import REPORT, TIMELINE, results_file
+from animat.studies.places import REPORT, RESULTS, TIMELINE
 from animat.studies.results import read_typed
 from animat.studies.simulating import controllability, read_series
 from animat.studies.specification import Arm, Study
@@ -46,7 +46,7 @@ class Publish(StudyTask):
 
     def make(self, folder: Path, progress: Progress) -> list[Path]:
         study, manifest = self.study, json.loads((folder / MANIFEST).read_text())
-        results = read_typed(results_file(folder), Results)
+        results = read_typed(folder / RESULTS, Results)
         kept: dict[float, Fidelity] = {}
         series: list[Responses] = []
         if study.needs_neurons:

@@ -22,7 +22,7 @@ from animat.studies.evaluating import as_recorded, policies_of
 from animat.studies.optima import complete_optima, key_of, kinds_of, missing_capabilities, read_optima
 from animat.studies.outperforming import compare_with_heuristic, compare_with_reflex
 from animat.studies.paper import PRINTED
-from animat.studies.places import controls_file, episodes_file, results_file, table_file
+from animat.studies.places import RESULTS, controls_file, episodes_file, table_file
 from animat.studies.results import write_records, write_table, write_typed
 from animat.studies.simulating import controllability
 from animat.studies.specification import Arm, RobotSpec, Study, mapping_label
@@ -34,8 +34,6 @@ LEVEL = 0.01
 
 LEFT_OUT = "left-out"
 """The finding that the study lacks something, as a robot cannot do it."""
-
-CURVES = ("robot", "arm", "policy", "iterations", "episodes", "mean_return")
 
 
 @final
@@ -58,7 +56,7 @@ class Tabulate(StudyTask):
             goals=tuple(goals_met(study, table)),
             reflexes=tuple(row for spec in study.robots for row in compare_with_reflex(study, table, spec, optima)),
         )
-        files = [write_typed(results_file(folder), results)]
+        files = [write_typed(folder / RESULTS, results)]
         for name, kinds in get_type_hints(Results).items():
             rows = getattr(results, name)
             # Findings have other columns, below, and most studies have no goals.
@@ -66,7 +64,8 @@ class Tabulate(StudyTask):
                 files.append(write_records(table_file(folder, name), get_args(kinds)[0], rows))
         findings = ((finding.severity, finding.name, finding.message) for finding in results.findings)
         files.append(write_table(table_file(folder, "findings"), ("severity", "name", "message"), findings))
-        files.append(write_table(table_file(folder, "learning-curves"), CURVES, _curves(study, folder)))
+        columns = ("robot", "arm", "policy", "iterations", "episodes", "mean_return")
+        files.append(write_table(table_file(folder, "learning-curves"), columns, _curves(study, folder)))
         if timeline is not None:
             head = ("at_min", "condition", "above_median_in_data", "above_median_in_simulator")
             rows = (

@@ -29,8 +29,6 @@ FORMER = {
     "algorithm": FORMER_SETTINGS,
 }
 """Former names of keys, by table ("" is the top level)."""
-FORMER_CHANNELS = 256
-"""Former files have this `channels` in every culture, which only synthetic recordings used; it is ignored."""
 
 
 @checked_arguments
@@ -71,7 +69,8 @@ def _with_current_keys(data: dict[str, Any]) -> dict[str, Any]:
     data = _rename_keys(data, FORMER[""])
     data |= {name: _rename_keys(data[name], names) for name, names in FORMER.items() if name in data}
     culture = data.get("culture")
-    if isinstance(culture, dict) and culture.get("channels") == FORMER_CHANNELS:
+    # Former files have this in every culture, although only synthetic recordings used it.
+    if isinstance(culture, dict) and culture.get("channels") == 256:
         data["culture"] = {key: value for key, value in culture.items() if key != "channels"}
     return data
 

@@ -15,8 +15,7 @@ from PIL import Image
 from animat.errors import InvalidArgument, InvalidFile
 from animat.extras import install_command
 from animat.progress import Progress, Silent
-from animat.report.film.frame import HEIGHT_PX, WIDTH_PX, Frames
-from animat.report.film.robot import pictures_of
+from animat.report.film.frame import HEIGHT_PX, WIDTH_PX, Frames, pictures_of
 from animat.report.film.scene import Scene
 from animat.robots.drawing import ACCENT, BODY, GOAL, GOAL_FILL, INK, RAIL, TRAIL
 from animat.writing import atomic_write

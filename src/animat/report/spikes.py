@@ -1,4 +1,4 @@
-"""The raster: every spike as a dot, around the stimuli of a recording, or over all of it with its network bursts."""
+"""Figures of spikes: the raster, around stimuli or over all of a recording, and the post-stimulus time histogram."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from animat.recordings.recording import Recording
 from animat.report.style import (
     BLACK,
     BLUE,
+    GREY,
     RED,
     WINDOW,
     add_common_legend,
@@ -22,6 +23,7 @@ from animat.report.style import (
     style_axes,
 )
 from animat.responses.network_bursts import NetworkBursts
+from animat.responses.psth import PostStimulusHistogram
 from animat.responses.responses import Responses
 from animat.responses.windows import HALF_NS_S, spikes_in
 from animat.tables import evenly
@@ -33,6 +35,8 @@ _MOST_DOTS = 3000
 _MOST_BINS = 100
 _MOST_SPIKES = 200_000
 _MOST_POINTS = 2_000
+_ARTEFACT_MS = 5.0
+"""Bins closer to the stimulus do not set the height of the histogram's axis if they would dwarf all others."""
 
 
 def draw_raster(recording: Recording, responses: Responses) -> Figure:
@@ -71,6 +75,41 @@ def draw_spontaneous(recording: Recording, bursts: NetworkBursts) -> Figure:
     lower.set_ylim(bottom=0)
     style_axes(lower, counted(len(bursts), "network burst"), "time (s)", "rate (Hz per channel)")
     add_legend(lower, loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0)
+    return figure
+
+
+def draw_psth(
+    histogram: PostStimulusHistogram, window_ms: tuple[float, float], spontaneous_hz: float | None = None
+) -> Figure:
+    """Mean rate per channel against the time from the stimulus; a stretch lost in the artefact is empty.
+
+    The response window is marked, and the spontaneous rate per channel is a line.
+    """
+    figure = new_figure(7.5, 3.8)
+    axes = figure.subplots()
+    rate_hz = np.nan_to_num(histogram.rate_hz)
+    label = f"window {window_ms[0]:g}-{window_ms[1]:g} ms"
+    axes.axvspan(*window_ms, color=WINDOW, alpha=0.25, linewidth=0, label=label)
+    axes.stairs(rate_hz, histogram.edges_ms, fill=True, color=BLUE)
+    axes.axvline(0, color=RED, linewidth=1, label="stimulus")
+    if spontaneous_hz is not None and np.isfinite(spontaneous_hz):
+        axes.axhline(spontaneous_hz, color=GREY, linewidth=1, linestyle="--", label="spontaneous rate")
+    axes.set_xlim(histogram.edges_ms[0], histogram.edges_ms[-1])
+    width_ms = histogram.edges_ms[1] - histogram.edges_ms[0]
+    of = f"{counted(histogram.n_stimuli, 'stimulus', 'stimuli')}, {counted(histogram.n_channels, 'channel')}"
+    title = f"{of}, bins of {width_ms:g} ms"
+    centres_ms = 0.5 * (histogram.edges_ms[1:] + histogram.edges_ms[:-1])
+    # Bins inside the response window always count, however close to the stimulus they are.
+    inside = (histogram.edges_ms[:-1] >= window_ms[0] - 1e-9) & (histogram.edges_ms[1:] <= window_ms[1] + 1e-9)
+    clear = (np.abs(centres_ms) > _ARTEFACT_MS) | inside
+    highest_hz = 1.1 * float(max(rate_hz[clear].max(initial=0.0), 2 * np.nan_to_num(spontaneous_hz or 0.0)))
+    if highest_hz and rate_hz.max() > 1.5 * highest_hz:
+        title += f"; the artefact, up to {rate_hz.max():.3g} Hz, is cut off"
+        axes.set_ylim(0, highest_hz)
+    else:
+        axes.set_ylim(0, None)
+    style_axes(axes, title, "time from stimulus (ms)", "firing rate (Hz per channel)")
+    add_legend(axes, loc="upper right")
     return figure
 
 
