@@ -270,12 +270,9 @@ def _why_no_optimum(loop: Loop, calibration: Calibration) -> str | None:
 
 
 def check_policies(policies: Mapping[str, Policy]) -> Policy:
-    """Raise unless policies can take turns in one closed loop; return the first, which represents all.
+    """The first of policies that can take turns in one closed loop, which represents all.
 
-    Raises:
-        InvalidArgument: for no policies.
-        Mismatch: if they differ in robot, mapping, readouts, conditions, presentation, response window, percentiles,
-            delivery, cost of pulses, or how their training simulators were fitted.
+    Raises InvalidArgument for no policies, and Mismatch if they differ in more than in their networks.
     """
     alike = ("robot", "mapping", "readouts", "conditions", "commands", "presentation", "window_ms", "fitted")
     return first_of_alike(policies, (*alike, "percentiles", "delivery", "pulse_cost"), "run it alone")

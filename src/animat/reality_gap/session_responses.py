@@ -22,12 +22,7 @@ _TICK += [(name, np.float64) for name in ("read_s", "late_s", "first_s")] + [("e
 
 
 class CommandSums(NamedTuple):
-    """The commands that each condition led to.
-
-    Attributes:
-        presented: how often each condition was presented.
-        total: the sum of its commands, each of them separately.
-    """
+    """How often each condition was presented, and the sum of the commands that it led to, each of them separately."""
 
     presented: Int64[np.ndarray, "*any conditions"]
     total: Float64[np.ndarray, "*any conditions commands"]

@@ -14,10 +14,7 @@ _TITLE_WIDE_IN = 3.0
 
 
 def draw_controls(panels_of: Sequence[tuple[str, Sequence[ControlReturns]]], title: str) -> Figure:
-    """One panel per mapping and recording: mean returns with standard errors, random actions and the optimum.
-
-    Each panel has a title, and the trained policies followed by the controls.
-    """
+    """A titled panel per mapping and recording: returns of trained policies and controls, random ones, the optimum."""
     most = max(len(rows) for _, rows in panels_of)
     figure, panels = grid_of_panels(len(panels_of), 2, 4.6, 0.9 + 0.24 * most, title)
     for axes, (through, rows) in zip(panels, panels_of, strict=True):

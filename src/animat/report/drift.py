@@ -48,10 +48,7 @@ def drift_of(series: Sequence[Responses]) -> Drift:
 
 
 def draw_drift(series: Sequence[Responses]) -> Figure:
-    """Pooled percentiles, P(x >= P50) of at most 12 conditions, and the share of bursts, all over time.
-
-    `series` is as for `drift_of`.
-    """
+    """`drift_of` a series: pooled percentiles, P(x >= P50) of at most 12 conditions, and the share of bursts."""
     drift = drift_of(series)
     minutes, percentiles = drift.minutes, drift.percentiles_hz
     figure = new_figure(7.0, 7.5)

@@ -20,10 +20,7 @@ _WIDE_IN = 3.1
 
 
 def draw_paths(robot: Robot[Any], paths: Mapping[str, Sequence[Path]], title: str) -> Figure:
-    """One panel per arm with one episode of each policy, drawn by the robot's method `draw_paths`.
-
-    Observations are in the robot's units.
-    """
+    """One panel per arm with one episode of each policy, in the robot's units, drawn by its method `draw_paths`."""
     draw = capability(robot, "draw_paths")
     figure, panels = grid_of_panels(len(paths), 3, _WIDE_IN, 2.5, title)
     for axes, (name, episodes) in zip(panels, paths.items(), strict=True):

@@ -21,11 +21,10 @@ class LearningCurve:
     """The learning curve of one arm.
 
     Attributes:
-        iterations: done at the end of each chunk of training, shape (chunks,).
-        returns: mean return of the episodes that ended by then (`over_rounds`), NaN if not known, shape
-            (policies, chunks).
+        iterations: done at the end of each chunk of training.
+        returns: mean return of the episodes that ended by then (`over_rounds`), NaN if not known.
         random, optimum: return of random actions and optimal return with the simulator in use in each chunk, NaN if not
-            known, shape (chunks,); None if known for no chunk.
+            known; None if known for no chunk.
     """
 
     name: str

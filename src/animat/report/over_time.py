@@ -44,10 +44,7 @@ def quartiles(returns: Float64[np.ndarray, "policies recordings"]) -> Float64[np
 
 
 def draw_over_time(panels_of: Sequence[Courses], title: str, *, trained_until_min: float) -> Figure:
-    """One panel per mapping: median and quartiles over policies of each of its first arms, against the minute.
-
-    The end of training on the culture's clock is marked.
-    """
+    """One panel per mapping: median and quartiles over policies of each of its first arms; training's end is marked."""
     figure, panels = grid_of_panels(len(panels_of), 2, _WIDE_IN, 3.4, title, share_x=True)
     names = list(dict.fromkeys(name for of in panels_of for name in list(of.returns)[:_MOST]))
     for axes, of in zip(panels, panels_of, strict=True):

@@ -231,11 +231,7 @@ def protocol_for(n_commands: int) -> protocol.Protocol:
 
 @dataclass(frozen=True)
 class ContextRun:
-    """Results of the study: rows of each culture and robot, and what was lost by each intervention.
-
-    Attributes:
-        done_now: processor seconds of each job that this run did.
-    """
+    """Rows of each culture and robot, what was lost by each intervention, and CPU seconds of the jobs of this run."""
 
     folder: Path
     rows: tuple[ContextRow, ...]
@@ -251,10 +247,7 @@ def run_context_study(
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> ContextRun:
-    """Run the study in a folder, or resume it there: finished jobs are not run again.
-
-    Arguments and errors are those of `animat.studies.run.run_study`.
-    """
+    """Run the study in a folder, or resume it there; arguments and errors as in `animat.studies.run.run_study`."""
     expect_workers(workers, executor)
     folder = Path(folder).absolute()
     versions = versions_of(_PACKAGES) | {"virtual tissue": f"revision {REVISION}"}

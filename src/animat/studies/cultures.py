@@ -48,11 +48,8 @@ class CulturesRun:
     """Results of a run over cultures.
 
     Attributes:
-        folder: contains a folder for each culture.
-        finished: the finished cultures, by the name of their folder.
-        failed: the errors of the others.
-        comparisons: of each finished culture, by name.
-        summary: each comparison over all finished cultures.
+        finished, failed: the finished cultures, and the errors of the others, by the names of their folders.
+        comparisons, summary: of each finished culture, and over all of them.
         parquet: the scores as a Parquet table; None if fastparquet is missing.
     """
 
@@ -126,7 +123,6 @@ def _write_manifest(folder: Path, names: Iterable[str], failed: Mapping[str, str
 
 
 def _write_tables(folder: Path, finished: dict[str, StudyRun], failed: dict[str, str]) -> CulturesRun:
-    """Write the tables over the finished cultures."""
     if not finished:
         raise AnimatError("; ".join(f"{name}: {error}" for name, error in failed.items()))
     results = {name: read_typed(each.folder / RESULTS, Results) for name, each in finished.items()}

@@ -31,12 +31,7 @@ _ABOUT_FILES = "# files: relative to the original specification. To run it from 
 
 @dataclass(frozen=True)
 class StudyRun:
-    """The result of running a study.
-
-    Attributes:
-        jobs: number of jobs of the study.
-        done_now: processor seconds of each job that this run did; empty if the folder was finished.
-    """
+    """A study's folder and report, its number of jobs, and the CPU seconds of those that this run did, by name."""
 
     folder: Path
     report: Path

@@ -37,9 +37,7 @@ def read_study(path: str | os.PathLike[str]) -> Study:
 
     Keys are the attributes of `animat.studies.specification.Study` and of the tables in it. A key that is left out has
     its default; an unknown key is refused. Lists in robots, arms and comparisons stand for all combinations.
-
-    Raises:
-        InvalidFile: naming the file, the key, what was expected and what came.
+    Raises InvalidFile, naming the file, the key, what was expected and what came.
     """
     return study_from(read_toml(path), path)
 

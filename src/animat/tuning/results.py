@@ -28,7 +28,6 @@ class Final:
 
     Attributes:
         trial: the trial that tried them first; 0: the study's own settings.
-        settings: the searched settings.
         returns: mean return of each policy in fresh episodes; None if a policy's parameters were not finite.
     """
 
@@ -54,10 +53,7 @@ class TuningResult:
     """The outcome of a tuning.
 
     Attributes:
-        folder: the folder of all its files.
-        best: the best final.
         finals: the study's own settings, the defaults if they were tried, then the best trials, best first.
-        trials: all trials.
         importance: share of each setting, the largest first; empty for fewer than four trials.
     """
 

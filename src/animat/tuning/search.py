@@ -33,8 +33,6 @@ class TrialResult:
     """The result of a trial.
 
     Attributes:
-        trial: number of the trial.
-        settings: the settings tried.
         state: `"complete"`, `"stopped"` before the end of training, as others did better, or `"diverged"`: its
             parameters were no longer finite.
         chunks: chunks of training done at the end of each rung that it reached with finite parameters.
