@@ -29,7 +29,7 @@ from animat.execution.training import train
 from animat.progress import Silent
 from animat.studies.cultures import run_over_cultures
 from animat.studies.places import RECEIPTS
-from animat.studies.plan import plan_study
+from animat.studies.run import plan_study
 from animat.studies.run import run_study
 from animat.studies.source import Source
 from animat.studies.toml import read_study

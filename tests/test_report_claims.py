@@ -34,7 +34,6 @@ from animat.studies.differences import decisions, differing_comparisons, explain
 from animat.studies.optima import kinds_of, kinds_over_time
 from animat.studies.paper import paper_study
 from animat.studies.places import optima_file
-from animat.studies.plan import plan_study
 from animat.studies.publishing import (
     _as_in_paper,
     _colophon,
@@ -47,6 +46,7 @@ from animat.studies.publishing import (
 )
 from animat.studies.report_tables import comparisons_table, controllability_table
 from animat.studies.results import write_typed
+from animat.studies.run import plan_study
 from animat.studies.source import Source
 from animat.studies.specification import Arm, Compared, RobotSpec, Simulators, Study
 from animat.studies.tabulating import AS_IN_PAPER, FIRST, NONE, SECOND, TOO_FEW, outcome_of

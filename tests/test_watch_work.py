@@ -21,7 +21,7 @@ from animat.execution.task import NOTICES, UNFINISHED
 from animat.recordings.reading import read_recording
 from animat.responses.inspection import inspect_recording
 from animat.studies.context import ContextStudy, plan_context_study
-from animat.studies.plan import plan_study
+from animat.studies.run import plan_study
 from animat.studies.toml import read_study
 from animat.training.policy import CURVE
 from animat.watch.cultures import CulturesView

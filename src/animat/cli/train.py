@@ -147,10 +147,6 @@ class Train(SimulatorOptions, JobOptions):
             expect_fit(robot.name, robot.n_commands, count_readouts(readouts))
         elif readouts != ALL:
             raise InvalidArgument(f"--readouts: expected none without neurons, got {self.readouts}")
-        elif self.delivery != "chosen":
-            raise InvalidArgument(f"--delivery: expected none without neurons, got {self.delivery}")
-        elif self.recordings:
-            raise InvalidArgument(f"--recordings: expected none without neurons, got {self.recordings[0]}")
         else:
             self.expect_no_simulator("without neurons")
         lessons = () if self.lessons is None else read_lessons(self.lessons)

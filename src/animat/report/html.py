@@ -40,13 +40,8 @@ def with_links(text: str, files: Sequence[str] = ()) -> str:
     parts = re.split(f"({names})", text) if names else [text]
     link = Markup('<a href="{}">{}</a>')
     # Every second part is a name.
-    linked = (link.format(url_of(part), part) if i % 2 else escape(with_minus(part)) for i, part in enumerate(parts))
+    linked = (link.format(quote(part), part) if i % 2 else escape(with_minus(part)) for i, part in enumerate(parts))
     return Markup("").join(linked)
-
-
-def url_of(file: str) -> str:
-    """The link to a file relative to the page: names can contain `#` or `:`, which mean something else in a link."""
-    return quote(file)
 
 
 @dataclass(frozen=True)
@@ -162,7 +157,8 @@ def write_page(
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"cell": cell, "prose": with_links, "data_url": _data_url, "url": url_of}
+    # Names of files can contain `#` or `:`, which mean something else in a link.
+    environment.filters |= {"cell": cell, "prose": with_links, "data_url": _data_url, "url": quote}
     page = environment.get_template("report.html.j2")
     filled = page.render(title=title, lead=lead, sections=sections, anchors=anchors_of(sections), colophon=colophon)
     return write_whole(Path(path), filled)

@@ -120,18 +120,14 @@ def _is_claimed(folder: Path, what: str, manifest: dict[str, Any], files: list[s
     """Whether the folder already belongs to this work, whose description is the first of its files, or is free."""
     found = read_description(folder / files[0], what)
     if found is None:
-        if folder.is_dir() and not all(map(_is_hidden, folder.iterdir())):
+        # Hidden files are half written by a killed run, locks, or another program's.
+        if folder.is_dir() and not all(path.name.startswith(".") for path in folder.iterdir()):
             raise Mismatch(f"{folder}: expected an empty folder or one of this {what}, got one with other files in it")
         return False
     if found["fingerprint"] == manifest["fingerprint"]:
         return all((folder / name).exists() for name in files)
     # Work that stopped at its first step left only these files, and may be replaced.
-    left = (path for path in folder.rglob("*") if not path.is_dir() and not _is_hidden(path))
+    left = (path for path in folder.rglob("*") if not path.is_dir() and not path.name.startswith("."))
     if any(path.name not in files and path.parent.name != NOTICES for path in left):
         raise folder_mismatch(folder, what, first_difference(found, manifest, ignoring=("fingerprint",)))
     return False
-
-
-def _is_hidden(path: Path) -> bool:
-    """Whether a file may be ignored: half written by a killed run, a lock, or hidden by another program."""
-    return path.name.startswith(".")

@@ -141,13 +141,7 @@ class FindOptima(StudyTask):
 
 @dataclass
 class _Request:
-    """An optimum to compute.
-
-    Attributes:
-        case: environment and simulator; None if no condition has enough responses.
-        counted: the responses of the simulator; None without neurons.
-        left_out: conditions with too few responses.
-    """
+    """An optimum to compute: `case` is None if no condition has enough responses, `counted` None without neurons."""
 
     kind: Arm
     at_min: float

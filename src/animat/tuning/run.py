@@ -21,9 +21,8 @@ from animat.execution.task import UNFINISHED
 from animat.progress import Part, Progress, Silent
 from animat.studies.folder import claim_folder, describe_study, hash_files, source_files
 from animat.studies.places import OWN_FOLDERS, RECEIPTS
-from animat.studies.plan import ITERATIONS_PER_S
 from animat.studies.recording import JOB, Record
-from animat.studies.run import check_custom
+from animat.studies.run import ITERATIONS_PER_S, check_custom
 from animat.studies.task import draw_seed
 from animat.training.group import split_groups
 from animat.training.specification import CHUNKS
