@@ -51,9 +51,8 @@ from animat.studies.folder import claim_folder, describe_study, hash_files
 from animat.studies.paper import PRINTED, paper_study
 from animat.studies.pictures import CulturePictures
 from animat.studies.places import controls_file, episodes_file, paths_file
-from animat.studies.recording import Record
+from animat.studies.recording import Fit, Record
 from animat.studies.run import StudyRun, plan_study, run_study
-from animat.studies.simulating import Fit
 from animat.studies.source import Source
 from animat.studies.specification import Arm, Compared, RobotSpec, Simulators, Study
 from animat.studies.toml import read_study, study_to_toml

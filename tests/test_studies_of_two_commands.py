@@ -19,9 +19,8 @@ from animat.recordings.reading import read_recordings
 from animat.responses.series import extract_series
 from animat.robots import Wheels
 from animat.stimulation.protocol import TWO_COMMANDS
-from animat.studies.recording import Record
+from animat.studies.recording import Fit, Record, controllability
 from animat.studies.run import run_study
-from animat.studies.simulating import Fit, controllability
 from animat.studies.source import Source
 from animat.studies.specification import Arm, Compared, RobotSpec, Simulators, Study
 from animat.studies.task import draw_seed

@@ -33,10 +33,9 @@ from animat.studies.figure_tables import write_paths
 from animat.studies.optima import FindOptima, read_optima
 from animat.studies.pictures import _courses, _minutes_in_training
 from animat.studies.places import RESULTS, controls_file, episodes_file, optima_file, table_file
-from animat.studies.recording import Record
+from animat.studies.recording import Fit, Record
 from animat.studies.report_tables import optima_table
 from animat.studies.results import read_typed, write_typed
-from animat.studies.simulating import Fit
 from animat.studies.source import Source
 from animat.studies.specification import Arm, Compared, RobotSpec, Study, mapping_label
 from animat.studies.tabulating import References, Tabulate, _controls, _finite, _optimum_error, _scores

@@ -24,7 +24,6 @@ from animat.extras import expect_extra
 
 P = ParamSpec("P")
 T = TypeVar("T")
-
 _CONNECT_S = 60
 
 

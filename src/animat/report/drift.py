@@ -14,7 +14,6 @@ from animat.responses.responses import Responses
 
 PERCENTILES = (10, 25, 50, 75, 90)
 """Percentiles of the responses that are drawn."""
-
 _MOST_CONDITIONS = 12
 
 

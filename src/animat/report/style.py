@@ -16,7 +16,6 @@ from animat.lazy import Axes, Figure
 from animat.writing import atomic_write
 
 FORMATS = ("png", "svg", "pdf")
-
 PNG_DPI = 160
 # Okabe and Ito's palette, which people with any common colour blindness can tell apart.
 BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"

@@ -18,7 +18,6 @@ from animat.studies.tabulating import LEVEL
 
 AIM = 0.97
 """Normalised score from which an arm counts as being as good as its optimum allows."""
-
 PAPER_POLICIES = 10
 """Per arm. Source: Sawada et al. 2022."""
 

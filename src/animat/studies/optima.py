@@ -17,8 +17,8 @@ from animat.robots.base import lacking
 from animat.robots.grid import why_no_grid
 from animat.studies.evaluating import as_recorded, setting_of
 from animat.studies.places import optima_file
+from animat.studies.recording import read_series
 from animat.studies.results import read_typed, write_typed
-from animat.studies.simulating import read_series
 from animat.studies.specification import Arm, RobotSpec, Study
 from animat.studies.task import StudyTask
 
@@ -26,7 +26,6 @@ STEPS_OVER_TIME = 0.5
 """Grid steps along each axis for the optima of every recording, as a fraction of those elsewhere."""
 STEPS_BOOTSTRAPPED = 0.8
 """Grid steps along each axis for bootstrapped responses, at most, as a fraction of the optimum's."""
-
 _COPIED = ("grid_error", "monte_carlo", "standard_error", "without_clock", "without_clock_standard_error", "nodes")
 """Columns of the table that an `Optimum` has under the same name."""
 

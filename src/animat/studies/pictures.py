@@ -35,8 +35,8 @@ from animat.studies.episodes import POLICY, Paths, mean_returns, rows_where
 from animat.studies.evaluating import as_recorded
 from animat.studies.optima import kinds_of
 from animat.studies.places import RECORDINGS, RESULTS, paths_file
+from animat.studies.recording import read_series
 from animat.studies.results import read_arrays, read_typed
-from animat.studies.simulating import read_series
 from animat.studies.specification import Arm, RobotSpec, Study, mapping_label
 from animat.studies.tabulating import References, all_episodes, learning_of, performances
 from animat.studies.task import StudyTask

@@ -31,8 +31,8 @@ from animat.studies.folder import MANIFEST
 from animat.studies.outperforming import describe_reflexes, not_outperforming
 from animat.studies.pictures import round_of
 from animat.studies.places import REPORT, RESULTS, TIMELINE
+from animat.studies.recording import controllability, read_series
 from animat.studies.results import read_typed
-from animat.studies.simulating import controllability, read_series
 from animat.studies.specification import Arm, Study
 from animat.studies.tabulating import FIRST, LEFT_OUT, LEVEL, NONE, SECOND, all_episodes, performances
 from animat.studies.task import StudyTask

@@ -91,8 +91,7 @@ def plan_study(study: Study, base: Path) -> list[Job]:
     from animat.studies.optima import FindOptima, kinds_of
     from animat.studies.pictures import CulturePictures, RobotPictures
     from animat.studies.publishing import Publish
-    from animat.studies.recording import JOB, Record
-    from animat.studies.simulating import Fit
+    from animat.studies.recording import JOB, Fit, Record
     from animat.studies.tabulating import Tabulate
     from animat.studies.training import TrainGroup
     from animat.training.group import split_groups

@@ -23,15 +23,14 @@ from animat.studies.optima import complete_optima, key_of, kinds_of, missing_cap
 from animat.studies.outperforming import compare_with_heuristic, compare_with_reflex
 from animat.studies.paper import PRINTED
 from animat.studies.places import RESULTS, controls_file, episodes_file, table_file
+from animat.studies.recording import controllability
 from animat.studies.results import write_records, write_table, write_typed
-from animat.studies.simulating import controllability
 from animat.studies.specification import Arm, RobotSpec, Study, mapping_label
 from animat.studies.task import StudyTask
 from animat.writing import atomic_write
 
 LEVEL = 0.01
 """The p below which an arm counts as better: by the normal approximation and uncorrected, as in the paper."""
-
 LEFT_OUT = "left-out"
 """The finding that the study lacks something, as a robot cannot do it."""
 
@@ -175,7 +174,6 @@ def _scores(known: References, first: float, last: float) -> Iterator[Score]:
 
 FIRST, SECOND, NONE = "first better", "second better", f"none found (p ≥ {LEVEL:g})"
 TOO_FEW = "too few policies to tell"
-
 AS_IN_PAPER = {FIRST: "no", SECOND: "yes", NONE: "no", TOO_FEW: "cannot tell"}
 """Whether each outcome agrees with the paper, in which the second arm was always better."""
 

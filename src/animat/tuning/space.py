@@ -20,7 +20,6 @@ THROUGH_NEURONS = ("mapping", *_OF_SIMULATORS)
 FITTING = ("environments", "replay")
 """Settings of the algorithm that depend on each other: one is a multiple of the other."""
 SEARCHABLE = (*(field.name for field in fields(SAC)), *THROUGH_NEURONS)
-
 Value = float | int | str
 Settings = dict[str, Value]
 """Settings by name: those of the algorithm, and `mapping`, `simulator`, `conditions`, `readouts`."""

@@ -23,7 +23,7 @@ from animat.evaluation.rollouts import Networks, roll_out
 from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import SimulatorTimeline, load_timeline, save_timeline
 from animat.progress import Progress
-from animat.studies.simulating import fit_simulators, one_condition, read_series
+from animat.studies.recording import fit_simulators, one_condition, read_series
 from animat.studies.specification import Study
 from animat.studies.task import StudyTask
 from animat.studies.training import training_of
