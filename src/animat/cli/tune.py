@@ -24,11 +24,9 @@ class TuneFile(JobOptions):
 
     def run(self) -> dict[str, Any]:
         from animat.columns import align_columns
-        from animat.tuning.search import expect_optuna
         from animat.tuning.specification import read_tuning
 
         tuning = read_tuning(self.specification)
-        expect_optuna()
         from animat.tuning.results import BEST, HISTORY, IMPORTANCE, describe_settings
         from animat.tuning.run import tune
         from animat.tuning.space import first_settings

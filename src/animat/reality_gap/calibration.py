@@ -100,8 +100,8 @@ class Calibration:
                 which it was trained.
             at_min: the minute whose newest recording is used instead; None without a policy: the last.
             adaptive: whether the loop's thresholds will adapt, or are fixed. With adaptive thresholds, simulators are
-                made of responses as these read them (`reread`), except for recordings in blocks
-                and for policies whose mapping is not thresholds.
+                made of responses as these read them (`reread`), except for recordings in blocks and for policies
+                whose mapping is not thresholds.
             kind, bins, range_hz: of the simulator, see `fit_timeline`.
 
         Raises:
@@ -168,12 +168,8 @@ def reread(responses: Responses, adjusted: AdjustedRanks) -> Responses:
     read again, by thresholds that begin with the first responses of each condition and adapt after each trial
     (`animat.closed_loop.adaptive`). A simulator of these responses takes only the rest for chance.
 
-    Args:
-        responses: of a recording that is not in blocks, where condition and time would be confounded.
-        adjusted: of these responses.
-
-    Returns:
-        The responses with x read again, for all channels or for readouts; nothing else changes.
+    The recording is not in blocks, where condition and time would be confounded. Only x changes, of all channels or of
+    readouts.
     """
     first = [slice(kept) for kept in kept_counts(adjusted)]
     first_hz, first_ranks = (

@@ -90,15 +90,8 @@ def run_over_cultures(
     fails, the others continue, and the failure is reported at the end. More cultures may be added later; finished jobs
     are not run again.
 
-    Args:
-        study: with `seeds` or `folders` in its culture.
-        folder: for all files; created if it is missing.
-        base, workers, executor, progress: as for `run_study`.
-
-    Raises:
-        AnimatError: if the study of every culture failed, with the error of each.
-        Mismatch: if the folder holds other work, or is in use by another run.
-        InvalidArgument: for fewer than one worker, or workers together with an executor.
+    Arguments and errors are those of `run_study`, for a study with `seeds` or `folders` in its culture; AnimatError is
+    raised if the study of every culture failed, with the error of each.
     """
     expect_workers(workers, executor)
     folder = Path(folder).absolute()
