@@ -30,8 +30,7 @@ from animat.training.lessons import Lesson
 from animat.training.policy import Policy
 from animat.training.settings import SAC
 from animat.training.specification import Training
-from animat.tuning.space import with_settings
-from animat.tuning.specification import Tune, tuning_of
+from animat.tuning.specification import Tune, tuning_of, with_settings
 
 NEAR = Lesson(starts={"x_m": (0.4, 0.6)}, until_return=45)
 HERE = Path(__file__).parent

@@ -29,7 +29,7 @@ class TuneFile(JobOptions):
         tuning = read_tuning(self.specification)
         from animat.tuning.results import BEST, HISTORY, IMPORTANCE, describe_settings
         from animat.tuning.run import tune
-        from animat.tuning.space import first_settings
+        from animat.tuning.specification import first_settings
 
         self.print_caveats(tuning.study.robots)
         began = time.monotonic()

@@ -9,9 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, final
 
-import numpy as np
-from jaxtyping import Float64
-
 from animat.errors import counted
 from animat.evaluation.statistics import p_of_u
 from animat.neurons.fidelity import Fidelity
@@ -26,7 +23,6 @@ from animat.studies import report_tables
 from animat.studies.arms import arm_differences, arms_table, describe_mapping, summarise_arms
 from animat.studies.captions import BURSTS, CULTURE, HEADLINE, NO_BURSTS, ROBOT, Caption
 from animat.studies.differences import decisions, differing_comparisons
-from animat.studies.episodes import DataFrame
 from animat.studies.folder import MANIFEST
 from animat.studies.outperforming import describe_reflexes, not_outperforming
 from animat.studies.pictures import round_of
@@ -52,7 +48,10 @@ class Publish(StudyTask):
         if study.needs_neurons:
             kept = controllability(load_timeline(folder / TIMELINE))
             series = read_series(study, folder, as_one=True)
-        headline = _headline(study, results, all_episodes(study, folder, study.robots))
+        table = all_episodes(study, folder, study.robots)
+        # Each arm at the last recording that it was evaluated on, as its scores are in the order of its minutes.
+        last = {(row.robot, row.arm): row for row in results.scores}.values()
+        headline = [(row, performances(table, row.robot, study.arm(row.arm), row.at_min, row.episodes)) for row in last]
         drawn = save_formats(draw_headline(headline), folder, "figures/headline")
         narrow = save_figure(draw_headline(headline, narrow=True), folder / "figures" / "headline-narrow.png")
         title, caption = "Every arm on every robot", HEADLINE.format(**_facts_of(study))
@@ -62,9 +61,9 @@ class Publish(StudyTask):
             pictures = _pictures(folder, spec.name, ROBOT, {**_facts_of(study), "round": f"{round_of(study, spec):,}"})
             sections.append(Section(_begin(spec.name), pictures=pictures))
         if kept:
-            table = report_tables.controllability_table(study, folder, kept)
+            tables = (report_tables.controllability_table(study, folder, kept),)
             pictures = _pictures(folder, "culture", CULTURE, _facts_of_culture(series))
-            sections.append(Section("The culture", tables=(table,), pictures=pictures))
+            sections.append(Section("The culture", tables=tables, pictures=pictures))
         sections += [_controls(study, results), _compared(study, results), _scores(results)]
         if study.paper:
             sections.append(_differences(study, results, kept, series))
@@ -114,15 +113,6 @@ def _found_better(rows: Sequence[ComparedReturns]) -> str:
     if len(rows) == 1:
         return f"The second arm was {'' if found else 'not '}found to be better."
     return f"In {found} of {len(rows)} comparisons the second arm was found to be better."
-
-
-def _headline(study: Study, results: Results, table: DataFrame) -> list[tuple[Score, Float64[np.ndarray, " policies"]]]:
-    """Each arm on each robot at the last recording that it was evaluated on, with the mean return of each policy."""
-    # Scores of an arm are in the order of its minutes.
-    last = {(row.robot, row.arm): row for row in results.scores}
-    return [
-        (row, performances(table, row.robot, study.arm(row.arm), row.at_min, row.episodes)) for row in last.values()
-    ]
 
 
 def _summary(study: Study, results: Results, headline: Sequence[Score], picture: Picture) -> Section:

@@ -15,8 +15,7 @@ from animat.report.tuning import draw_history, draw_importance
 from animat.studies.places import RECORDINGS
 from animat.studies.toml import study_to_toml
 from animat.tuning.search import TrialResult, importance_of
-from animat.tuning.space import SEARCHABLE, THROUGH_NEURONS, Settings, with_settings
-from animat.tuning.specification import Tuning
+from animat.tuning.specification import SEARCHABLE, THROUGH_NEURONS, Settings, Tuning, with_settings
 from animat.writing import write_whole
 
 BEST, RESULTS, HISTORY, IMPORTANCE = "best.toml", "results.json", "history.png", "importance.png"

@@ -28,8 +28,7 @@ from animat.training.group import split_groups
 from animat.training.specification import CHUNKS
 from animat.tuning.results import Final, TuningResult, write_results
 from animat.tuning.search import Search, TrialResult, expect_optuna, read_journal, write_journal
-from animat.tuning.space import choices_of, first_settings, with_settings
-from animat.tuning.specification import Tuning
+from animat.tuning.specification import Tuning, choices_of, first_settings, with_settings
 from animat.tuning.tasks import Fit, TrainTrials, Trial, group_by_shape, returns_file, timeline_file
 
 MANIFEST = "tune.json"

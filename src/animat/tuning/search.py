@@ -14,8 +14,7 @@ from animat.extras import expect_extra
 from animat.records import Number, read_record
 from animat.studies.task import draw_seed
 from animat.training.settings import SAC
-from animat.tuning.space import Range, Settings, Space, Value, first_settings
-from animat.tuning.specification import Tuning
+from animat.tuning.specification import Range, Settings, Space, Tuning, Value, first_settings
 from animat.writing import write_whole
 
 if TYPE_CHECKING:

@@ -31,7 +31,7 @@ from animat.training.group import CHECKPOINT_S, Group, SideBySide
 from animat.training.sac import Learner, begin, train_chunk
 from animat.training.settings import SAC
 from animat.training.specification import CHUNKS, Training
-from animat.tuning.space import NUMBERS, Settings, with_settings
+from animat.tuning.specification import NUMBERS, Settings, with_settings
 from animat.wrappers import EpisodeLimit
 from animat.writing import write_whole
 
