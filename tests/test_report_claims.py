@@ -22,8 +22,7 @@ from animat.report.comparisons import Pair, draw_comparisons
 from animat.report.controls import draw_controls
 from animat.report.headline import draw_headline
 from animat.report.html import Picture, Section, Table, with_links, with_minus, write_page
-from animat.report.learning_curves import LearningCurve, draw_learning_curves, over_rounds
-from animat.report.over_time import Courses, draw_over_time
+from animat.report.over_time import Courses, LearningCurve, draw_learning_curves, draw_over_time, over_rounds
 from animat.report.results import ComparedReturns, ControlReturns, OverCultures, Results, Score, StudyOptimum
 from animat.report.style import save_figure
 from animat.robots import Cartpole

@@ -13,9 +13,8 @@ from animat.recordings.findings import Finding
 from animat.recordings.recording import Recording
 from animat.recordings.response_table import ResponseTable
 from animat.report.array import draw_array
-from animat.report.burst_separation import draw_burst_separation
 from animat.report.drift import draw_drift
-from animat.report.response_histograms import draw_response_histograms, draw_responses_over_time
+from animat.report.response_histograms import draw_burst_separation, draw_response_histograms, draw_responses_over_time
 from animat.report.spikes import draw_psth, draw_raster, draw_spontaneous
 from animat.report.style import save_figure
 from animat.responses.inspection import Inspection

@@ -23,7 +23,7 @@ BLUE, RED, PURPLE, GREY = "#0072B2", "#D55E00", "#CC79A7", "#8C8C8C"
 PALETTE = (BLUE, ORANGE, GREEN, PURPLE, SKY, RED)
 """In the order of use."""
 WINDOW, OPTIMUM = ORANGE, BLACK
-NON_BURST, BURST, MEDIAN = BLUE, RED, RED
+MEDIAN = RED
 
 # Text stays text in an SVG. Without the salt, element names are random, and the same figure gives different files.
 _SAVING: dict[Any, Any] = {"svg.fonttype": "none", "svg.hashsalt": "animat"}

@@ -21,14 +21,12 @@ from animat.recordings.reading import read_recordings
 from animat.recordings.recording import Recording
 from animat.records import read_record
 from animat.report.array import draw_array, rates_of_sites
-from animat.report.burst_separation import draw_burst_separation
 from animat.report.comparisons import Pair, draw_comparisons
 from animat.report.controls import draw_controls
 from animat.report.drift import PERCENTILES, Drift, draw_drift, drift_of
 from animat.report.episodes import draw_frames, draw_paths
-from animat.report.learning_curves import LearningCurve, draw_learning_curves, mean_with_interval, over_rounds
-from animat.report.over_time import Courses, draw_over_time, quartiles
-from animat.report.response_histograms import draw_response_histograms, draw_responses_over_time
+from animat.report.over_time import Courses, LearningCurve, draw_learning_curves, draw_over_time, over_rounds
+from animat.report.response_histograms import draw_burst_separation, draw_response_histograms, draw_responses_over_time
 from animat.report.results import ComparedReturns, ControlReturns, Results
 from animat.report.spikes import draw_psth, draw_raster
 from animat.report.style import save_formats
@@ -273,7 +271,7 @@ def write_learning(folder: Path, robot: str, curves: Sequence[LearningCurve]) ->
     rows: list[tuple[Any, ...]] = []
     for curve in curves:
         ended = np.count_nonzero(np.isfinite(curve.returns), axis=0).tolist()
-        interval = (column.tolist() for column in mean_with_interval(curve.returns))
+        interval = (column.tolist() for column in curve.mean_with_interval())
         levels = ([None] * len(ended) if each is None else each.tolist() for each in (curve.random, curve.optimum))
         iterations = (int(done) for done in curve.iterations)
         rows += [(curve.name, *row) for row in zip(iterations, ended, *interval, *levels, strict=True)]
@@ -288,7 +286,7 @@ def write_courses(folder: Path, robot: str, panels: Sequence[Courses]) -> Path:
         for arm, returns in panel.returns.items():
             for i, at_min in enumerate(panel.minutes.tolist()):
                 levels = (None if each is None else float(each[i]) for each in (panel.random, panel.optimum))
-                known = panel.title, arm, at_min, len(returns), *quartiles(returns)[:, i].tolist()
+                known = panel.title, arm, at_min, len(returns), *panel.quartiles(arm)[:, i].tolist()
                 rows.append((*known, *levels, panel.fine_optimum.get(at_min)))
     return _write(folder, f"{robot}-over-time", (*head, "optimum_rough_grid", "optimum_fine_grid"), rows)
 
