@@ -30,9 +30,9 @@ from animat.studies.arms import arm_differences, arms_table
 from animat.studies.captions import CULTURE, HEADLINE, ROBOT
 from animat.studies.cultures import CulturesRun, _describe, _summary
 from animat.studies.differences import decisions, differing_comparisons, explain
+from animat.studies.folder import optima_file
 from animat.studies.optima import kinds_of, kinds_over_time
 from animat.studies.paper import paper_study
-from animat.studies.places import optima_file
 from animat.studies.publishing import (
     _as_in_paper,
     _colophon,

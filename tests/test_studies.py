@@ -47,10 +47,9 @@ from animat.robots import Cartpole, Navigation
 from animat.stimulation.protocol import Protocol, read_protocol
 from animat.stimulation.selection import SelectionRule
 from animat.studies.captions import CULTURE, ROBOT
-from animat.studies.folder import claim_folder, describe_study, hash_files
+from animat.studies.folder import claim_folder, controls_file, describe_study, episodes_file, hash_files, paths_file
 from animat.studies.paper import PRINTED, paper_study
 from animat.studies.pictures import CulturePictures
-from animat.studies.places import controls_file, episodes_file, paths_file
 from animat.studies.recording import Fit, Record
 from animat.studies.run import StudyRun, plan_study, run_study
 from animat.studies.source import Source

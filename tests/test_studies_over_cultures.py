@@ -33,7 +33,7 @@ from animat.studies.cultures import (
     studies_of,
     write_cultures_page,
 )
-from animat.studies.places import RESULTS
+from animat.studies.folder import RESULTS
 from animat.studies.results import write_typed
 from animat.studies.run import StudyRun, run_study
 from animat.studies.source import Source, read_seeds

@@ -29,9 +29,9 @@ from animat.responses.series import extract_series
 from animat.robots import Navigation
 from animat.studies.episodes import COLUMNS, RANDOM, Paths, episode_rows, mean_returns, read_episodes, write_episodes
 from animat.studies.evaluating import Evaluate
+from animat.studies.folder import RESULTS, controls_file, episodes_file, optima_file, table_file
 from animat.studies.optima import FindOptima, read_optima
 from animat.studies.pictures import _courses, _minutes_in_training, write_paths
-from animat.studies.places import RESULTS, controls_file, episodes_file, optima_file, table_file
 from animat.studies.recording import Fit, Record
 from animat.studies.report_tables import optima_table
 from animat.studies.results import read_typed, write_typed

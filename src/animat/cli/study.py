@@ -40,8 +40,8 @@ def run_and_report(study: Study, base: Path, command: JobOptions) -> dict[str, A
 def _run_one(study: Study, base: Path, command: JobOptions) -> dict[str, Any]:
     from animat.columns import align_columns
     from animat.report.results import Results
+    from animat.studies.folder import RESULTS
     from animat.studies.outperforming import not_outperforming
-    from animat.studies.places import RESULTS
     from animat.studies.results import read_typed
     from animat.studies.run import run_study
 

@@ -102,10 +102,7 @@ class Calibration:
             adaptive: whether the loop's thresholds will adapt, or are fixed. With adaptive thresholds, simulators are
                 made of responses as these read them (`reread`), except for recordings in blocks and for policies
                 whose mapping is not thresholds.
-            kind, bins, range_hz: of the simulator, see `fit_timeline`.
-
-        Raises:
-            InvalidArgument, Mismatch, UnusableData: as in `fit_timeline`.
+            kind, bins, range_hz: of the simulator, see `fit_timeline`, whose errors are raised.
         """
         timeline = fit_timeline(series, kind=kind, bins=bins, range_hz=range_hz)
         fit: dict[str, Any] = {"kind": timeline.fitted["kind"], "bins": bins, "range_hz": range_hz}

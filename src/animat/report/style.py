@@ -99,9 +99,7 @@ def condition_colours(units: Sequence[str]) -> list[str]:
 def save_figure(figure: Figure, path: str | os.PathLike[str]) -> Path:
     """Write a figure atomically as PNG, SVG or PDF, by the path's suffix.
 
-    Raises:
-        InvalidArgument: for another suffix.
-        InvalidFile: if the file cannot be written.
+    Raises InvalidArgument for another suffix, and InvalidFile if the file cannot be written.
     """
     import matplotlib
 

@@ -35,8 +35,7 @@ from animat.responses.series import extract_series
 from animat.robots.host import HostRobot
 from animat.robots.registry import robot_named
 from animat.stimulation import protocol
-from animat.studies.folder import MANIFEST, claim_folder
-from animat.studies.places import RECEIPTS
+from animat.studies.folder import MANIFEST, RECEIPTS, claim_folder
 from animat.studies.results import write_records
 from animat.studies.run import run_jobs
 from animat.studies.specification import Episodes, Resolution

@@ -13,7 +13,7 @@ from animat.report.html import Columns, Section, Table, cell, columns_of, pictur
 from animat.report.results import ContextRow, LostRow
 from animat.report.style import save_formats
 from animat.studies.context import TABLE, WHOSE_WORK, ContextRun, ContextStudy
-from animat.studies.places import REPORT
+from animat.studies.folder import REPORT
 
 
 def write_context_page(study: ContextStudy, found: ContextRun) -> Path:

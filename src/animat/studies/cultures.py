@@ -27,7 +27,7 @@ from animat.report.html import Section, cell, columns_of, picture_of, table_of, 
 from animat.report.results import ComparedReturns, OverCultures, Results, Score
 from animat.report.style import save_formats
 from animat.studies.arms import arm_differences, arms_table, summarise_arms
-from animat.studies.places import REPORT, RESULTS
+from animat.studies.folder import REPORT, RESULTS
 from animat.studies.results import read_typed, write_named_records, write_parquet, write_records
 from animat.studies.run import StudyRun, run_study
 from animat.studies.source import read_seeds

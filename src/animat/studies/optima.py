@@ -16,7 +16,7 @@ from animat.report.results import StudyOptimum
 from animat.robots.base import lacking
 from animat.robots.grid import why_no_grid
 from animat.studies.evaluating import as_recorded, setting_of
-from animat.studies.places import optima_file
+from animat.studies.folder import optima_file
 from animat.studies.recording import read_series
 from animat.studies.results import read_typed, write_typed
 from animat.studies.specification import Arm, RobotSpec, Study
@@ -72,11 +72,8 @@ def missing_capabilities(study: Study) -> list[str]:
 class FindOptima(StudyTask):
     """Compute the optimal return on a robot for every mapping of the study, over conditions with enough responses.
 
-    For a robot without a grid the table is empty.
-
-    Attributes:
-        over_time: at every recording, on a coarse grid, without the controller's return and without an interval;
-            otherwise at the minutes at which anything is evaluated.
+    It is computed at the minutes at which anything is evaluated, or `over_time` at every recording, on a coarse grid,
+    without the controller's return and without an interval. For a robot without a grid the table is empty.
     """
 
     sizes = ("optimum_resolution", "optimum_episodes")

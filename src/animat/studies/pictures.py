@@ -35,8 +35,8 @@ from animat.responses.responses import Responses
 from animat.robots.base import lacking
 from animat.studies.episodes import POLICY, Paths, mean_returns, rows_where
 from animat.studies.evaluating import as_recorded
+from animat.studies.folder import RECORDINGS, RESULTS, paths_file, table_file
 from animat.studies.optima import kinds_of
-from animat.studies.places import RECORDINGS, RESULTS, paths_file, table_file
 from animat.studies.recording import read_series
 from animat.studies.results import read_arrays, read_typed, write_table
 from animat.studies.specification import Arm, RobotSpec, Study, mapping_label

@@ -23,10 +23,9 @@ from animat.studies import report_tables
 from animat.studies.arms import arm_differences, arms_table, describe_mapping, summarise_arms
 from animat.studies.captions import BURSTS, CULTURE, HEADLINE, NO_BURSTS, ROBOT, Caption
 from animat.studies.differences import decisions, differing_comparisons
-from animat.studies.folder import MANIFEST
+from animat.studies.folder import MANIFEST, REPORT, RESULTS, TIMELINE
 from animat.studies.outperforming import describe_reflexes, not_outperforming
 from animat.studies.pictures import round_of
-from animat.studies.places import REPORT, RESULTS, TIMELINE
 from animat.studies.recording import controllability, read_series
 from animat.studies.results import read_typed
 from animat.studies.specification import Arm, Study

@@ -19,8 +19,7 @@ from animat.recordings.reading import read_recordings
 from animat.responses.readouts import ALL, readouts_named
 from animat.responses.responses import Responses
 from animat.responses.series import extract_series
-from animat.studies.folder import source_files
-from animat.studies.places import RECEIPTS, RECORDINGS, RESPONSES, TIMELINE
+from animat.studies.folder import RECEIPTS, RECORDINGS, RESPONSES, TIMELINE, source_files
 from animat.studies.results import write_table
 from animat.studies.specification import Study
 from animat.studies.task import StudyTask

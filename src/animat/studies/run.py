@@ -19,8 +19,7 @@ from animat.execution.jobs import Job, Jobs, expect_workers
 from animat.execution.task import UNFINISHED
 from animat.progress import Progress, Silent
 from animat.robots.checking import check_robot
-from animat.studies.folder import MANIFEST, claim_folder, describe_study, hash_files, source_files
-from animat.studies.places import RECEIPTS, REPORT
+from animat.studies.folder import MANIFEST, RECEIPTS, REPORT, claim_folder, describe_study, hash_files, source_files
 from animat.studies.specification import Arm, RobotSpec, Study
 from animat.studies.toml import study_to_toml
 

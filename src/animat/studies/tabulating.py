@@ -19,10 +19,10 @@ from animat.recordings.findings import Finding
 from animat.report.results import TRAINED, ComparedReturns, ControlReturns, Results, Score, StudyOptimum
 from animat.studies.episodes import POLICY, RANDOM, DataFrame, goals_met, mean_returns, read_episodes, rows_where
 from animat.studies.evaluating import as_recorded, policies_of
+from animat.studies.folder import RESULTS, controls_file, episodes_file, table_file
 from animat.studies.optima import complete_optima, key_of, kinds_of, missing_capabilities, read_optima
 from animat.studies.outperforming import compare_with_heuristic, compare_with_reflex
 from animat.studies.paper import PRINTED
-from animat.studies.places import RESULTS, controls_file, episodes_file, table_file
 from animat.studies.recording import controllability
 from animat.studies.results import write_records, write_table, write_typed
 from animat.studies.specification import Arm, RobotSpec, Study, mapping_label

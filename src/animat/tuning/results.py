@@ -12,7 +12,7 @@ from typing import Any
 
 from animat.report.style import save_figure
 from animat.report.tuning import draw_history, draw_importance
-from animat.studies.places import RECORDINGS
+from animat.studies.folder import RECORDINGS
 from animat.studies.toml import study_to_toml
 from animat.tuning.search import TrialResult, importance_of
 from animat.tuning.specification import SEARCHABLE, THROUGH_NEURONS, Settings, Tuning, with_settings

@@ -19,8 +19,7 @@ from animat.execution.jobs import Job, Jobs, expect_workers
 from animat.execution.pinned import PinnedProcesses, own_cores
 from animat.execution.task import UNFINISHED
 from animat.progress import Part, Progress, Silent
-from animat.studies.folder import claim_folder, describe_study, hash_files, source_files
-from animat.studies.places import OWN_FOLDERS, RECEIPTS
+from animat.studies.folder import OWN_FOLDERS, RECEIPTS, claim_folder, describe_study, hash_files, source_files
 from animat.studies.recording import JOB, Record
 from animat.studies.run import ITERATIONS_PER_S, check_custom
 from animat.studies.task import draw_seed

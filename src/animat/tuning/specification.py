@@ -89,9 +89,8 @@ def default_space(study: Study) -> Space:
 def read_space(table: Mapping[str, Any], study: Study) -> Space:
     """The search of a file's `[tune.search]`: tables `{ low, high, log }` and lists of choices, by name.
 
-    Raises:
-        InvalidArgument: for a setting that cannot be searched, an invalid range or list of choices, a value that the
-            setting cannot have, or a search that does not include the study's own setting, with which it begins.
+    Raises InvalidArgument for a setting that cannot be searched, an invalid range or list of choices, a value that the
+    setting cannot have, or a search that does not include the study's own setting, with which it begins.
     """
     if not table:
         raise InvalidArgument("tune.search: expected at least one setting to search for, got none")
