@@ -91,15 +91,12 @@ def over_rounds(
 
     In a round every environment ends at least one episode. The episodes that end in a shorter time are a biased sample:
     first the short ones, which succeeded or failed early, and later the long ones, as environments that begin together
-    stay in step.
+    stay in step. Before the end of the first round it is NaN; a training shorter than a round is one round.
 
     Args:
         iterations: done at the end of each chunk, by all environments together.
         episodes, returns: the number of episodes that ended in each chunk, and their mean return.
         longest: iterations of a round: those of the longest possible episode, times the number of environments.
-
-    Returns:
-        Mean returns; NaN before the end of the first round. If training is shorter than a round, all of it is one.
     """
     longest_known = min(float(longest), float(iterations[-1]))
     # The number of chunks that ended at least a round before the end of each.

@@ -222,9 +222,9 @@ def _scores(results: Results) -> Section:
     note = (
         "Means over policies; the interquartile mean is that of the middle half, with its 95 % interval by Student's t."
     )
-    goals = (report_tables.goals_table(results.goals),) if results.goals else ()
+    goals = (report_tables.goals_table(results),) if results.goals else ()
     optima = report_tables.optima_table(results.optima)
-    return Section("Scores", (note,), tables=(report_tables.scores_table(results.scores), optima, *goals))
+    return Section("Scores", (note,), tables=(report_tables.scores_table(results), optima, *goals))
 
 
 def _facts_of(study: Study) -> dict[str, str]:
@@ -274,13 +274,13 @@ def _controls(study: Study, results: Results) -> Section:
             "The best reflex: a fixed rule from sensed values to a stimulus, without memory and without a goal.",
         ),
     )
-    comparisons = report_tables.heuristic_table(results.heuristic), report_tables.reflexes_table(results.reflexes)
+    comparisons = report_tables.heuristic_table(results), report_tables.reflexes_table(results)
     sentences = [*(f"{each}." for each in not_outperforming(results)), *describe_reflexes(results.reflexes)]
     return Section(
         "Is it the culture?",
         ("Each control removes something.", *map(_begin, sentences)),
         points,
-        (*(table for table in comparisons if table.rows), report_tables.controls_table(study, results.controls)),
+        (*(table for table in comparisons if table.rows), report_tables.controls_table(study, results)),
     )
 
 

@@ -8,15 +8,7 @@ from typing import Any
 
 from animat.neurons.fidelity import LARGEST_LOSS, Fidelity
 from animat.report.html import Columns, Table, cell, columns_of, table_of, with_error
-from animat.report.results import (
-    ComparedReturns,
-    ControlReturns,
-    HeuristicComparison,
-    ObjectiveMet,
-    ReflexComparison,
-    Score,
-    StudyOptimum,
-)
+from animat.report.results import ComparedReturns, Results, StudyOptimum
 from animat.responses.quality.responses import FEW_SAMPLES
 from animat.studies.optima import complete_optima, key_of, kinds_over_time, read_optima
 from animat.studies.outperforming import NOT
@@ -70,11 +62,11 @@ def returns_table(rows: Sequence[ComparedReturns]) -> Table:
     )
 
 
-def scores_table(rows: Sequence[Score]) -> Table:
+def scores_table(results: Results) -> Table:
     """Every arm at every minute at which it was evaluated."""
     return table_of(
         "Every arm",
-        rows,
+        results.scores,
         [
             *columns_of("robot", "arm", "at_min", "policies", "episodes"),
             ("mean", "mean_return"),
@@ -159,18 +151,18 @@ def controllability_table(study: Study, folder: Path, kept: Mapping[float, Fidel
     return Table(title, head, tuple(rows), note=note, beside=file, marked=tuple(marked))
 
 
-def controls_table(study: Study, rows: Sequence[ControlReturns]) -> Table:
+def controls_table(study: Study, results: Results) -> Table:
     """Trained policies and the controls of their mapping, at every recording at which anything is evaluated."""
     note = (
         "Trained policies are listed with their controls, as in the figures above. ±: standard error over actors; for "
         "one actor, over its episodes. Silent and shuffled (also if trained so) have no score: their optimum differs."
     )
     any_command = any(spec.robot().baseline_commands is None for spec in study.robots)
-    if any_command and any(row.mapping == "none" for row in rows):
+    if any_command and any(row.mapping == "none" for row in results.controls):
         note += " Without neurons, where any command can be chosen, there is no constant control."
     return table_of(
         "Controls",
-        rows,
+        results.controls,
         [
             ("robot", "robot"),
             ("mapping", lambda row: mapping_label(row.mapping, row.percentiles)),
@@ -182,15 +174,15 @@ def controls_table(study: Study, rows: Sequence[ControlReturns]) -> Table:
         ],
         note=note,
         beside="tables/controls.csv",
-        folded=len(rows) > _MOST_ROWS,
+        folded=len(results.controls) > _MOST_ROWS,
     )
 
 
-def goals_table(rows: Sequence[ObjectiveMet]) -> Table:
+def goals_table(results: Results) -> Table:
     """One row for each objective, arm and control."""
     return table_of(
         "Goals",
-        rows,
+        results.goals,
         [
             *columns_of("robot", "arm", "agent", "at_min", "episodes"),
             ("success", "success_share"),
@@ -203,11 +195,11 @@ def goals_table(rows: Sequence[ObjectiveMet]) -> Table:
     )
 
 
-def heuristic_table(rows: Sequence[HeuristicComparison]) -> Table:
+def heuristic_table(results: Results) -> Table:
     """Trained policies and the heuristic policy, compared over episodes."""
     return table_of(
         "Policies and the heuristic policy",
-        rows,
+        results.heuristic,
         [
             *columns_of("robot", "arm", "at_min"),
             ("policies", "mean_return"),
@@ -218,15 +210,15 @@ def heuristic_table(rows: Sequence[HeuristicComparison]) -> Table:
         note="p: Mann-Whitney over episodes, two-sided. Pairs won: share of pairs of episodes in which the policies' "
         "return is larger, ties counting half. Highlighted: learning did no better than the heuristic policy.",
         beside="tables/heuristic.csv",
-        marked=tuple(i for i, row in enumerate(rows) if row.outcome == NOT),
+        marked=tuple(i for i, row in enumerate(results.heuristic) if row.outcome == NOT),
     )
 
 
-def reflexes_table(rows: Sequence[ReflexComparison]) -> Table:
+def reflexes_table(results: Results) -> Table:
     """Trained policies and the best coupling: context gap and context score."""
     return table_of(
         "Policies and the best reflex",
-        rows,
+        results.reflexes,
         [
             *columns_of("robot", "arm", "at_min"),
             ("best coupling", _pair("coupling", "coupling_standard_error")),

@@ -48,17 +48,8 @@ def tune(
     If killed at any moment and called again, it continues; the journal and the results are the same, byte for byte,
     with any number of workers. For this, trials are proposed `together` at a time, and reported in order.
 
-    Args:
-        tuning: the specification.
-        folder: folder for all files; created if missing.
-        base, workers, executor, progress: as in `animat.studies.run.run_study`.
-
-    Raises:
-        Mismatch: if the folder holds another tuning, its recordings have changed, or another run is active in it.
-        InvalidFile: if a file cannot be read or written.
-        InvalidArgument: for fewer than one worker, or any with an executor.
-        UnusableData: if no trial had finite returns.
-        AnimatError: if Optuna is not installed, or if a task failed, which the message names.
+    Arguments and errors are those of `animat.studies.run.run_study`; also UnusableData if no trial had finite returns,
+    and AnimatError if Optuna is not installed.
     """
     expect_optuna()
     expect_workers(workers, executor)
