@@ -188,8 +188,7 @@ class OverCultures:
         mean_first, mean_second: mean returns of the arms, each culture counting the same.
         difference: mean of the cultures' differences, second minus first.
         low_95, high_95: its percentile bootstrap interval over cultures, too narrow with few; None with fewer than two.
-        larger_in: number of cultures in which the second arm's mean return is larger.
-        holds_in: number of cultures in which the second arm was found to be better.
+        larger_in, holds_in: numbers of cultures in which the second arm's mean return is larger, and significantly so.
         tested: number of cultures with enough policies to find a difference.
     """
 

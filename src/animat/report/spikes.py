@@ -166,7 +166,9 @@ def _draw_stimuli(axes: Axes, recording: Recording, responses: Responses, from_m
         axes.scatter(lag_ms, row, s=2.5, c=[colours[drawn.index(i)] for i in condition[row]], linewidths=0)
         each = "each spike a dot"
     else:
-        _draw_rates(axes, row, lag_ms, len(chosen), len(recording.channels), from_ms, to_ms)
+        edges_ms = np.linspace(from_ms, to_ms, 1 + min(_MOST_BINS, round(to_ms - from_ms)))
+        count, *_ = np.histogram2d(row, lag_ms, bins=[np.arange(len(chosen) + 1) - 0.5, edges_ms - 1e3 * HALF_NS_S])
+        _draw_rates(axes, 1e3 * count / len(recording.channels) / (edges_ms[1] - edges_ms[0]), from_ms, to_ms)
         each = f"all {len(recording.channels):,} channels together"
     first = np.searchsorted(condition, drawn)
     middle = [(a + b - 1) / 2 for a, b in pairwise([*first, len(chosen)])]
@@ -182,26 +184,15 @@ def _draw_stimuli(axes: Axes, recording: Recording, responses: Responses, from_m
     style_axes(axes, title, "time from stimulus (ms)", "stimulus (row)")
 
 
-def _draw_rates(
-    axes: Axes,
-    row: Int64[np.ndarray, " spikes"],
-    lag_ms: Float64[np.ndarray, " spikes"],
-    rows: int,
-    channels: int,
-    from_ms: float,
-    to_ms: float,
-) -> None:
+def _draw_rates(axes: Axes, rate_hz: Float64[np.ndarray, "rows bins"], from_ms: float, to_ms: float) -> None:
     """The rate in each row and bin as a shade, as so many dots would merge."""
-    edges_ms = np.linspace(from_ms, to_ms, 1 + min(_MOST_BINS, round(to_ms - from_ms)))
-    count, *_ = np.histogram2d(row, lag_ms, bins=[np.arange(rows + 1) - 0.5, edges_ms - 1e3 * HALF_NS_S])
-    rate_hz = 1e3 * count / channels / (edges_ms[1] - edges_ms[0])
     # A burst in a row or two must not leave all others pale.
     drawn = axes.imshow(
         rate_hz,
         cmap="Greys",
         vmin=0,
         vmax=max(float(np.quantile(rate_hz, 0.95)), 1e-9),
-        extent=(from_ms, to_ms, -0.5, rows - 0.5),
+        extent=(from_ms, to_ms, -0.5, len(rate_hz) - 0.5),
         aspect="auto",
         origin="lower",
         interpolation="nearest",

@@ -86,10 +86,7 @@ class CulturePictures(StudyTask):
 @final
 @dataclass(frozen=True)
 class RobotPictures(StudyTask):
-    """Draw learning, comparisons, returns over the recordings, controls, paths and frames of one robot.
-
-    Numbers that no other table has are written to tables: learning with its intervals, returns over time, and paths.
-    """
+    """Draw learning, comparisons, returns over the recordings, controls, paths and frames of one robot."""
 
     spec: RobotSpec
 
@@ -206,10 +203,7 @@ def _controls(rows: Iterable[ControlReturns]) -> list[tuple[str, list[ControlRet
 def write_psth(
     folder: Path, histogram: PostStimulusHistogram, window_ms: tuple[float, float], spontaneous_hz: float
 ) -> Path:
-    """The post-stimulus time histogram of the first recording, one row per bin.
-
-    `in_window` is the share of the bin that lies in the response window.
-    """
+    """The histogram of the first recording, one row per bin; `in_window`: the bin's share in the response window."""
     from_ms, to_ms = histogram.edges_ms[:-1], histogram.edges_ms[1:]
     inside_ms = np.clip(np.minimum(to_ms, window_ms[1]) - np.maximum(from_ms, window_ms[0]), 0.0, None)
     head = ("from_ms", "to_ms", "in_window", "spikes", "stimuli", "channels", "rate_hz_per_channel")
