@@ -1,4 +1,4 @@
-"""What commands share: how they are run, the options of several, and how these are read and what ends a session."""
+"""What commands share: how they are run, options of several, how named numbers are read, and what ends a session."""
 
 from __future__ import annotations
 
