@@ -512,6 +512,31 @@ def test_raw_traces_of_a_maxwell_file(tmp_path: Path) -> None:
     assert read_traces(path, Detection()).spike_times_s.tolist() == recording.spike_times_s.tolist()
 
 
+def test_after_frames_that_a_maxone_lost_spikes_are_where_they_were(tmp_path: Path) -> None:
+    voltage, _ = noisy(3, 1.0, step_uv=6.3)
+    given = {"mapping": mapping_table([40, 9, 3], [3, 2, 1]), "spikes": None, "events": event_table([0.8], [""])}
+    path = write_maxwell(tmp_path / "a.h5", **given, recorded=[3, 9, 40], raw=(voltage.T + 512).astype("<u2"))
+    whole = read_traces(path)
+    kept = np.delete(np.arange(len(voltage)), np.s_[8000:8600])
+    with h5py.File(path, "r+") as file:
+        groups = file["wells/well000/rec0000/groups"]
+        raw, frames = groups["routed/raw"][:], groups["routed/frame_nos"][:]
+        del groups["routed/raw"], groups["routed/frame_nos"]
+        groups["routed/raw"], groups["routed/frame_nos"] = raw[:, kept], frames[kept]
+        # A group without traces began 400 frames before.
+        groups["alone/frame_nos"] = frames[:10] - 400
+    lost, far = read_traces(path), np.abs(whole.spike_times_s - 0.415) > 0.018
+    assert np.count_nonzero(whole.spike_times_s > 0.43) > 3
+    np.testing.assert_allclose(lost.spike_times_s, whole.spike_times_s[far] + 0.02, atol=1e-12)
+    np.testing.assert_array_equal(lost.spike_channels, whole.spike_channels[far])
+    assert (lost.stimuli.time_s.tolist(), lost.stop_s) == ([0.82], 1.02)
+    assert {f.name: f.value for f in lost.findings}.items() >= {"frames-lost": 600.0, "samples-lost": 1800.0}.items()
+    with h5py.File(path, "r+") as file:
+        file["wells/well000/rec0000/groups/routed/frame_nos"][5] = 0
+    with pytest.raises(InvalidFile, match="expected rising frame_nos for 19,400 samples"):
+        read_traces(path)
+
+
 def test_raw_traces_of_a_cl1_file(tmp_path: Path) -> None:
     voltage, _ = noisy(64, 0.5, step_uv=0.195)
     path = write_cl1(tmp_path / "a.h5", spikes=None, stims=[(5000, 9)], samples=voltage)
