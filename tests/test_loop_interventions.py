@@ -140,7 +140,9 @@ def test_controls_of_a_simulator_are_agents_of_a_loop() -> None:
     for name in ("silent", "shuffled"):
         assert agents[name].controller == POLICIES
         assert agents[name].delivery == name
+    # Whoever repeats stimuli, or those of another episode, gets other responses than mixed stimuli do.
     assert [name for name, agent in agents.items() if not agent.calibrates] == [f"constant {x}" for x in "abcde"]
+    assert [agent.name for agent in changed(ROBOT) if not agent.calibrates] == ["yoked"]
 
 
 @jax.tree_util.register_dataclass
