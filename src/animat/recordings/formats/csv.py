@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from animat.errors import InvalidFile, UnusableData, did_you_mean, some_of
+from animat.errors import InvalidFile, did_you_mean, in_file, some_of
 from animat.recordings.columns import REQUIRED, Column, PlainColumns
 from animat.recordings.findings import Finding
 from animat.recordings.formats.text_table import (
@@ -169,8 +169,6 @@ def _electrodes(table: TextTable, place: int) -> Column:
         except (ValueError, OverflowError) as error:
             expected = "expected whole numbers separated by spaces, of at most 64 bits"
             raise table.wrong(row, f"stimulus_electrodes: {expected}, got {cell[:40]!r}") from error
-    try:
+    # The file of the stimuli, not that of the spikes.
+    with in_file(table.path):
         return padded(lists)
-    except UnusableData as error:
-        # The file of the stimuli, not that of the spikes.
-        raise InvalidFile(f"{table.path}: {error}") from error
