@@ -289,8 +289,11 @@ def test_a_blank_is_a_straight_line_between_its_sides() -> None:
     line_uv = np.interp(np.arange(4000), [1989, 2030], [0.0, 50.0])
     np.testing.assert_allclose(cleaned.voltage_uv, [np.zeros(4000), line_uv], atol=1e-3)
     none = Detection(blank_ms=(0.0, 0.0))
-    unchanged = without_artefacts(trace.copy(), np.array([2000]), np.full(2, 100.0, np.float32), RATE_HZ, none)
-    assert np.array_equal(unchanged.voltage_uv, trace) and not unchanged.is_blank.any()
+    # A pulse without a blank changes nothing, nor does one whose blank ends before the stretch or begins after it.
+    for pulse, of_pulse in ((2000, none), (-3000, settings), (5000, settings)):
+        untouched = without_artefacts(trace.copy(), np.array([pulse]), np.full(2, 100.0, np.float32), RATE_HZ, of_pulse)
+        assert np.array_equal(untouched.voltage_uv, trace)
+        assert not (untouched.is_blank.any() or untouched.saturated.any())
 
 
 @pytest.mark.parametrize("amplitude", [1.0, 2.0, 5.0])
