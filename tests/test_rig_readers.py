@@ -426,14 +426,16 @@ def test_other_nwb_stimuli_in_series(tmp_path: Path, name: str, times_s: list[fl
         ("noise", [0.1, 0.9]),
         ("steps of a converter", [0.1, 0.5, 0.9]),
         ("an offset", [0.1, 0.5, 0.9]),
+        ("samples 2 ms apart", [0.1, 0.5, 0.9]),
     ],
 )
 def test_a_sampled_stimulus_begins_each_time_it_leaves_0(of: str, times_s: list[float], tmp_path: Path) -> None:
     import pynwb
 
     path = other_nwb(tmp_path / "a.nwb", stimuli=())
-    data = np.zeros(10_000)
-    for at, amplitude in ((1000, 300.0), (5000, -100.0), (9000, 200.0)):
+    rate_hz = 500 if of == "samples 2 ms apart" else 10_000
+    data = np.zeros(rate_hz)
+    for at, amplitude in ((rate_hz // 10, 300.0), (rate_hz // 2, -100.0), (rate_hz // 10 * 9, 200.0)):
         data[at : at + 4], data[at + 4 : at + 8] = amplitude, -amplitude
     if of == "noise":
         data += np.random.default_rng(0).normal(0, 20, len(data))
@@ -448,12 +450,12 @@ def test_a_sampled_stimulus_begins_each_time_it_leaves_0(of: str, times_s: list[
         if of == "an offset":
             # As a converter from analog to digital: 2048 is 0.
             stored = {"data": (data + 2048).astype(np.uint16), "conversion": 0.1, "offset": -204.8}
-        nwb.add_stimulus(pynwb.TimeSeries(name="wave", rate=10_000.0, starting_time=0.0, unit="mV", **stored))
-        wave = {**stored, "data": stored["data"][900:1010:50], "timestamps": [0.1, 0.2, 0.3]}
+        nwb.add_stimulus(pynwb.TimeSeries(name="wave", rate=float(rate_hz), starting_time=0.0, unit="mV", **stored))
+        wave = {**stored, "data": np.take(stored["data"], [900, 950, 1000], mode="clip"), "timestamps": [0.1, 0.2, 0.3]}
         nwb.add_acquisition(pynwb.TimeSeries(name="each", unit="mV", **wave))
         nwb_io.write(nwb)
     np.testing.assert_allclose(read_recording(path).stimuli.time_s, times_s)
-    if of not in ("noise", "steps of a converter"):
+    if of not in ("noise", "steps of a converter", "samples 2 ms apart"):
         np.testing.assert_allclose(read_recording(path, stimuli="each").stimuli.time_s, [0.3])
 
 
