@@ -282,12 +282,15 @@ def test_a_saturated_channel_is_blanked_until_it_moves_again() -> None:
 def test_a_blank_is_a_straight_line_between_its_sides() -> None:
     trace = np.zeros((2, 4000), np.float32)
     trace[1, 2000:] = 50.0
+    # What is more than ten samples away does not count.
+    trace[1, :1980], trace[1, 2040:] = 30.0, 20.0
+    expected = trace.copy()
+    expected[1, 1989:2031] = np.linspace(0.0, 50.0, 42)
     settings = Detection(blank_ms=(0.5, 1.5))
     # Far from rest only by half of the noise: nothing to fit.
     cleaned = without_artefacts(trace, np.array([2000]), np.full(2, 100.0, np.float32), RATE_HZ, settings)
     assert np.flatnonzero(cleaned.is_blank[1]).tolist() == list(range(1990, 2030))
-    line_uv = np.interp(np.arange(4000), [1989, 2030], [0.0, 50.0])
-    np.testing.assert_allclose(cleaned.voltage_uv, [np.zeros(4000), line_uv], atol=1e-3)
+    np.testing.assert_allclose(cleaned.voltage_uv, expected, atol=1e-3)
     none = Detection(blank_ms=(0.0, 0.0))
     # A pulse without a blank changes nothing, nor does one whose blank ends before the stretch or begins after it.
     for pulse, of_pulse in ((2000, none), (-3000, settings), (5000, settings)):
