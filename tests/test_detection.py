@@ -537,10 +537,12 @@ def test_after_frames_that_a_maxone_lost_spikes_are_where_they_were(tmp_path: Pa
     np.testing.assert_array_equal(lost.spike_channels, whole.spike_channels[far])
     assert (lost.stimuli.time_s.tolist(), lost.stop_s) == ([0.82], 1.02)
     assert {f.name: f.value for f in lost.findings}.items() >= {"frames-lost": 600.0, "samples-lost": 1800.0}.items()
-    with h5py.File(path, "r+") as file:
-        file["wells/well000/rec0000/groups/routed/frame_nos"][5] = 0
-    with pytest.raises(InvalidFile, match="expected rising frame_nos for 19,400 samples"):
-        read_traces(path)
+    # A number that falls, and one that would make days of it.
+    for place, number in ((-1, 2**40), (5, 0)):
+        with h5py.File(path, "r+") as file:
+            file["wells/well000/rec0000/groups/routed/frame_nos"][place] = number
+        with pytest.raises(InvalidFile, match="expected rising frame_nos for 19,400 samples"):
+            open_traces(path)
 
 
 def test_raw_traces_of_a_cl1_file(tmp_path: Path) -> None:
