@@ -619,6 +619,22 @@ def test_raw_traces_of_an_nwb_file(tmp_path: Path) -> None:
         read_traces(tmp_path / "a.nwb", Detection())
 
 
+def test_traces_of_an_nwb_file_are_on_the_electrodes_that_they_name(tmp_path: Path) -> None:
+    voltage, _ = noisy(2, 0.1, step_uv=1.0)
+    write_nwb_traces(tmp_path / "a.nwb", voltage, start_s=0.0)
+    nowhere = ["0", "1"], [np.nan, np.nan]
+    # The last two name rows that are not in the table.
+    for named, (labels, x_um) in (([2, 0], (["9", "7"], [30.0, 10.0])), ([3, 0], nowhere), ([-1, 0], nowhere)):
+        with h5py.File(tmp_path / "a.nwb", "r+") as file:
+            electrodes = file.require_group("general/extracellular_ephys/electrodes")
+            for name, values in {"id": [7, 8, 9], "rel_x": [10.0, 20.0, 30.0], "rel_y": [0.0, 0.0, 0.0]}.items():
+                electrodes.require_dataset(name, 3, type(values[0]))[:] = values
+            file["acquisition/traces"].require_dataset("electrodes", 2, int)[:] = named
+        channels = open_traces(tmp_path / "a.nwb")[0].channels
+        assert channels.label.tolist() == labels
+        np.testing.assert_array_equal(channels.x_um, x_um)
+
+
 def test_traces_that_begin_before_0_keep_stimuli_to_their_end(tmp_path: Path) -> None:
     voltage, _ = noisy(2, 6.0, step_uv=1.0)
     write_nwb_traces(tmp_path / "a.nwb", voltage, start_s=-1.0)
