@@ -529,8 +529,9 @@ def test_after_frames_that_a_maxone_lost_spikes_are_where_they_were(tmp_path: Pa
         raw, frames = groups["routed/raw"][:], groups["routed/frame_nos"][:]
         del groups["routed/raw"], groups["routed/frame_nos"]
         groups["routed/raw"], groups["routed/frame_nos"] = raw[:, kept], frames[kept]
-        # A group without traces began 400 frames before.
+        # A group without traces began 400 frames before, and one of a single channel lost none.
         groups["alone/frame_nos"] = frames[:10] - 400
+        groups["one/channels"], groups["one/raw"], groups["one/frame_nos"] = np.array([3], "<u4"), raw[:1], frames
     lost, far = read_traces(path), np.abs(whole.spike_times_s - 0.415) > 0.018
     assert np.count_nonzero(whole.spike_times_s > 0.43) > 3
     np.testing.assert_allclose(lost.spike_times_s, whole.spike_times_s[far] + 0.02, atol=1e-12)
