@@ -496,12 +496,12 @@ def test_raw_traces_of_a_maxwell_file(tmp_path: Path) -> None:
         mapping=mapping_table([40, 9, 3], [26_399, 2000, 1000]),
         spikes=None,
         events=event_table([0.5], [""]),
-        recorded=[3, 9, 40],
+        recorded=[9, 40, 3],
         raw=raw,
     )
     recording = read_traces(path, Detection())
-    assert recording.channels.label.tolist() == ["3", "9", "40"]
-    assert recording.channels.electrode.tolist() == [1000, 2000, 26_399]
+    assert recording.channels.label.tolist() == ["9", "40", "3"]
+    assert recording.channels.electrode.tolist() == [2000, 26_399, 1000]
     assert (recording.duration_s, len(recording.stimuli)) == (2.0, 1)
     found = DetectedSpikes(recording.spike_times_s, recording.spike_channels, np.empty(0), ())
     hit, missed, false = agreement(found, [at[np.abs(at - 10_000) > 60] for at in truth])
