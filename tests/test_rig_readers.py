@@ -256,7 +256,8 @@ def test_cl1_spikes_and_stimuli_with_parameters_from_the_data_stream(tmp_path: P
         tmp_path / "a",
         spikes=[(start + 50_000, 8), (start + 25_000, 62)],
         stims=[(start + 1000, 9), (start + 1000, 12), (start + 6000, 9), (start + 11_000, 20)],
-        stream=[(start + 990, packed_text(said(5, 0))), (start + 10_000, packed_text(said(40, 1)))],
+        # The second text is longer than a byte can say.
+        stream=[(start + 990, packed_text(said(5, 0))), (start + 10_000, packed_text(said(40, 1) + 300 * " "))],
         start=start,
         mark=mark,
     )
@@ -300,6 +301,9 @@ def test_cl1_without_stream_stimuli_or_spikes(tmp_path: Path) -> None:
     recording = read_recording(write_cl1(tmp_path / "a.h5", spikes=[(5, 1)], stims=[(1, 2)]))
     assert np.isnan(recording.stimuli.frequency_hz).all()
     assert len(read_recording(write_cl1(tmp_path / "b.h5", spikes=[(5, 1)], stims=None)).stimuli) == 0
+    # Longer than the rig had run before: its frames cannot be told from those of a recording that begins with 0.
+    long = read_recording(write_cl1(tmp_path / "d.h5", spikes=[(50_000, 1)], stims=[(25_000, 2)], start=20_000))
+    assert (long.spike_times_s.tolist(), long.stimuli.time_s.tolist()) == ([2.0], [1.0])
     path = write_cl1(tmp_path / "c.h5", spikes=None, stims=[(1, 2)], samples=np.zeros((10, 64), "<i2"))
     with pytest.raises(InvalidFile, match=r"expected spikes at /spikes.*include_spikes=False.*animat convert --raw"):
         read_recording(path)
