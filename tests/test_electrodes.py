@@ -215,6 +215,8 @@ def test_a_selection_is_saved_and_read(tmp_path: Path) -> None:
             Selection.load(tmp_path / "bad.json")
     with pytest.raises(InvalidFile, match="no such file"):
         Selection.load(tmp_path / "none.json")
+    with pytest.raises(InvalidArgument, match=r"selection\.recording: expected 1 dimensions, got \(1, 2\)"):
+        Selection(SMALL, np.array([[first, silent]]), selection.stimulation, selection.patterns)
 
 
 def test_an_invalid_scan_is_refused() -> None:
