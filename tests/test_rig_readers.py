@@ -128,11 +128,15 @@ def test_maxwell_frames_that_are_missing_are_counted_and_the_clock_starts_with_t
 def test_maxwell_events_without_patterns_in_their_text_have_their_number(tmp_path: Path) -> None:
     for words, pattern in (("frequency 5", [3, 8, 3]), ("pattern 1", [1, 1, 1])):
         events = event_table([0.1, 0.2, 0.3], [words] * 3)
-        events["eventid"] = [3, 8, 3]
         given: dict[str, Any] = {"mapping": TABLE, "spikes": spike_table([0.5], [9]), "events": events, "recorded": [9]}
+        events["eventid"] = [3, 8, 3]
         recording = read_recording(write_maxwell(tmp_path / f"{words}.h5", **given))
         assert recording.stimuli.pattern.tolist() == pattern
         assert ("stimulus_pattern" in recording.provenance) == (words == "frequency 5")
+        # The vendor's examples, and animat, count the events.
+        events["eventid"] = [1, 2, 3]
+        counted = read_recording(write_maxwell(tmp_path / f"{words} counted.h5", **given))
+        assert counted.stimuli.pattern.tolist() == ([UNKNOWN] * 3 if words == "frequency 5" else pattern)
 
 
 def test_what_is_in_the_text_of_some_pulses_only_is_not_guessed() -> None:
@@ -230,7 +234,8 @@ def test_old_maxwell_reads_bits_as_stimuli(tmp_path: Path) -> None:
 # --- CL1 -------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("start", [0, 90_000_000])
+# Frames that count from the start of the rig, also if that was less long before than the recording lasts.
+@pytest.mark.parametrize("start", [0, 90_000_000, 240_000])
 def test_cl1_spikes_and_stimuli_with_parameters_from_the_data_stream(tmp_path: Path, start: int) -> None:
     mark = tmp_path / "unpickled"
     path = write_cl1(

@@ -187,7 +187,8 @@ def _events(file: Hdf5File, layout: _Layout, stimuli: str | None) -> tuple[Colum
         columns = stimulus_columns(file.read(at, "eventmessage")[is_stimulus].tolist())
     if "eventid" in names and "stimulus_pattern" not in columns:
         identity = file.read(at, "eventid")[is_stimulus].astype(np.int64)
-        if len(np.unique(identity)) > 1 and np.all(identity >= 0):
+        # Numbers of which none comes twice count the events.
+        if 1 < len(np.unique(identity)) < len(identity) and np.all(identity >= 0):
             columns["stimulus_pattern"] = identity
             layout.provenance["stimulus_pattern"] = "the events' eventid"
     return frame[is_stimulus], columns
