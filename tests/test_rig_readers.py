@@ -420,7 +420,12 @@ def test_other_nwb_units_without_electrodes(tmp_path: Path) -> None:
     ("name", "times_s"), [("events", [0.1, 0.3]), ("wave", [1.1, 1.9]), ("stim_ttl", [0.1, 0.9]), ("lever", [])]
 )
 def test_other_nwb_stimuli_in_series(tmp_path: Path, name: str, times_s: list[float]) -> None:
-    np.testing.assert_allclose(read_recording(other_nwb(tmp_path / "a.nwb", stimuli=(name,))).stimuli.time_s, times_s)
+    path = other_nwb(tmp_path / "a.nwb", stimuli=(name,))
+    np.testing.assert_allclose(read_recording(path).stimuli.time_s, times_s)
+    if name == "events":
+        with h5py.File(path, "r+") as file:
+            file["stimulus/presentation/events"].attrs["neurodata_type"] = "IndexSeries"
+        assert read_recording(path).stimuli.time_s.tolist() == [0.1, 0.2, 0.3]
 
 
 @pytest.mark.parametrize(
@@ -456,8 +461,10 @@ def test_a_sampled_stimulus_begins_each_time_it_leaves_0(of: str, times_s: list[
         nwb.add_stimulus(pynwb.TimeSeries(name="wave", rate=10_000.0, starting_time=0.0, unit="mV", **stored))
         wave = {**stored, "data": stored["data"][900:1010:50], "timestamps": [0.1, 0.2, 0.3]}
         nwb.add_acquisition(pynwb.TimeSeries(name="each", unit="mV", **wave))
+        nwb.add_acquisition(pynwb.TimeSeries(name="timed", unit="mV", timestamps=3.0 + np.arange(1e4) / 1e4, **stored))
         nwb_io.write(nwb)
     np.testing.assert_allclose(read_recording(path).stimuli.time_s, times_s)
+    np.testing.assert_allclose(read_recording(path, stimuli="timed").stimuli.time_s, 3.0 + np.array(times_s))
     if of not in ("noise", "steps of a converter"):
         np.testing.assert_allclose(read_recording(path, stimuli="each").stimuli.time_s, [0.3])
 
