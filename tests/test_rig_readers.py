@@ -409,6 +409,23 @@ def test_other_nwb_columns_with_other_values_than_ours(
         assert recording.provenance["patterns"] == "0: 0.1, 1: 0.5"
 
 
+def test_other_nwb_lasts_as_long_as_its_units_were_observed(tmp_path: Path) -> None:
+    path = other_nwb(tmp_path / "a.nwb")
+    for spike_s, observed, span_s in (
+        ([105.0, 120.0, 119.0], [[101.0, 110.0], [115.0, 121.5]], (100.5, 121.5)),
+        # Intervals that leave out spikes are on another clock, or of some units only.
+        ([105.0, 120.0, 129.0], [[101.0, 110.0], [115.0, 121.5]], (0.0, 129.0)),
+        ([105.0, 120.0, 119.0], [[np.nan, np.inf]], (0.0, 120.0)),
+    ):
+        with h5py.File(path, "r+") as file:
+            file["units/spike_times"][...] = spike_s
+            file["stimulus/presentation/pulses/start_time"][...] = [100.5, 110.0]
+            file["units"].pop("obs_intervals", None)
+            file["units/obs_intervals"] = observed
+        recording = read_recording(path)
+        assert (recording.start_s, recording.stop_s) == span_s
+
+
 def test_other_nwb_units_without_electrodes(tmp_path: Path) -> None:
     recording = read_recording(other_nwb(tmp_path / "a.nwb", electrodes=False))
     assert len(recording.channels) == 3
