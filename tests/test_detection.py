@@ -555,6 +555,9 @@ def test_noise_is_in_microvolts_where_each_channel_has_its_own_conversion(tmp_pa
     traces, _ = open_traces(tmp_path / "a.nwb")
     np.testing.assert_allclose(detect_spikes(traces, np.empty(0), Detection()).noise_uv, expected, rtol=1e-5)
     with h5py.File(tmp_path / "a.nwb", "r+") as file:
+        file["acquisition/traces/data"].attrs["conversion"] = -1e-6
+    assert np.array_equal(open_traces(tmp_path / "a.nwb")[0].read_uv(0, 9), -traces.read_uv(0, 9))
+    with h5py.File(tmp_path / "a.nwb", "r+") as file:
         del file["acquisition/traces/channel_conversion"]
         file["acquisition/traces/channel_conversion"] = np.ones(3)
     with pytest.raises(InvalidFile, match="expected a conversion of each of the 2 traces, got 3"):
