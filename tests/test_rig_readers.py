@@ -222,13 +222,17 @@ def test_old_maxwell_reads_bits_as_stimuli(tmp_path: Path) -> None:
     bits = np.zeros(5, BITS)
     bits["frameno"] = FIRST_FRAME + np.array([2000, 2100, 4000, 4100, 4200])
     bits["bits"] = [1, 0, 2, 2, 0]
-    path = write_old_maxwell(tmp_path / "a.h5", mapping=TABLE, spikes=spike_table([0.11, 0.21], [9, 3]), bits=bits)
-    recording = read_recording(path)
+    given: dict[str, Any] = {"mapping": TABLE, "spikes": spike_table([0.11, 0.21], [9, 3]), "bits": bits}
+    recording = read_recording(write_old_maxwell(tmp_path / "a.h5", **given))
     assert recording.stimuli.time_s.tolist() == [0.1, 0.2]
     assert recording.stimuli.pattern.tolist() == [1, 2]
     assert recording.spike_times_s.tolist() == [0.11, 0.21]
     assert recording.channels.electrode[recording.spike_channels].tolist() == [2000, 1000]
     assert "3 of 5 entries of /bits" in found(recording)["bits-not-rising"]
+    assert "frames-lost" not in found(recording)
+    some_lost = read_recording(write_old_maxwell(tmp_path / "b.h5", **given, lost=9900))
+    assert (some_lost.start_s, some_lost.stop_s) == (0.0, 0.5)
+    assert found(some_lost)["frames-lost"].startswith("9,900 frames (0.495 s) are missing")
 
 
 # --- CL1 -------------------------------------------------------------------------------------------------------------
