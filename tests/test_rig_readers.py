@@ -331,6 +331,10 @@ def other_nwb(path: Path, electrodes: bool = True, stimuli: tuple[str, ...] = ("
             for at in (1000, 9000):
                 data[at : at + 4], data[at + 4 : at + 8] = -1.0, 1.0
             nwb.add_stimulus(pynwb.TimeSeries(name=name, data=data, rate=10_000.0, starting_time=1.0, unit="V"))
+        elif name == "line_ttl":
+            # As Open Ephys writes it: the number of the line, negative where it falls.
+            data, times_s = np.array([1, -1, 2, -2, 1], np.int8), [0.1, 0.11, 0.4, 0.41, 0.9]
+            nwb.add_acquisition(pynwb.TimeSeries(name=name, data=data, timestamps=times_s, unit="n/a"))
         else:
             nwb.add_acquisition(pynwb.TimeSeries(name=name, data=[1.0, 1.0], timestamps=[0.1, 0.9], unit="V"))
     with pynwb.NWBHDF5IO(str(path), "w") as nwb_io:
@@ -438,7 +442,14 @@ def test_other_nwb_units_without_electrodes(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "times_s"), [("events", [0.1, 0.3]), ("wave", [1.1, 1.9]), ("stim_ttl", [0.1, 0.9]), ("lever", [])]
+    ("name", "times_s"),
+    [
+        ("events", [0.1, 0.3]),
+        ("wave", [1.1, 1.9]),
+        ("stim_ttl", [0.1, 0.9]),
+        ("line_ttl", [0.1, 0.4, 0.9]),
+        ("lever", []),
+    ],
 )
 def test_other_nwb_stimuli_in_series(tmp_path: Path, name: str, times_s: list[float]) -> None:
     path = other_nwb(tmp_path / "a.nwb", stimuli=(name,))

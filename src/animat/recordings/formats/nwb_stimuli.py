@@ -187,7 +187,9 @@ def _of_series(file: Hdf5File, at: str) -> Column:
         step_s = float(np.ptp(time_s)) / len(time_s) if len(time_s) else 0.0
         if kind != "IntervalSeries" and 0 < step_s < APART_S:
             return np.asarray(time_s[_onsets(file, f"{at}/data", 1 / step_s).astype(np.int64)])
-        is_pulse = data > 0 if kind == "IntervalSeries" else _from_zero(file, f"{at}/data", data) != 0
+        # Where a digital input is recorded, a negative number is the end of a pulse.
+        has_ends = kind == "IntervalSeries" or (data.dtype.kind == "i" and not at.startswith(FIRST))
+        is_pulse = data > 0 if has_ends and np.any(data > 0) else _from_zero(file, f"{at}/data", data) != 0
         return np.asarray(time_s[is_pulse] if np.any(is_pulse) else time_s)
     rate_hz, start_s = file.attribute(f"{at}/starting_time", "rate"), file.first(f"{at}/starting_time")
     if not is_positive(rate_hz) or not isinstance(start_s, int | float):
