@@ -200,6 +200,8 @@ def test_numbers_in_the_text_of_events_are_read_whole(tmp_path: Path) -> None:
     np.testing.assert_array_equal(stimuli.frequency_hz, [20, 20, np.nan])
     assert stimuli.electrodes.tolist() == [[909, -1, -1], [-1, -1, -1], [909, 23923, 7]]
     assert stimuli.pattern.tolist() == [-1, -1, 3]
+    words = ["electrodes 9 7 0.5 mA", "electrodes: 9, 7; pattern 2", "electrode 9 electrode 7", "electrode 9 20 Hz"]
+    assert stimulus_columns(words)["stimulus_electrodes"].tolist() == [[9, 7], [9, 7], [9, 7], [9, -1]]
 
 
 def test_maxwell_raw_without_the_plugin_spikes_still_read(tmp_path: Path) -> None:
