@@ -74,9 +74,7 @@ def read_maxwell(
             f"{file.path}: expected spikes at /{layout.spikes}, found none: the rig kept raw traces only, or nothing; "
             "detect spikes in them with animat convert --raw"
         )
-    spike_frame, spike_channel = np.empty((2, 0), np.int64)
-    if spikes:
-        spike_frame, spike_channel = file.columns(layout.spikes, "frameno", "channel")
+    spike_frame, spike_channel = file.columns(layout.spikes, "frameno", "channel") if spikes else np.empty((2, 0), int)
     stimulus_frame, columns = np.empty(0, np.int64), dict[str, Any]()
     if file.has(layout.stimuli):
         stimulus_frame, columns = _bits(file, layout) if is_old(file) else _events(file, layout, stimuli)
