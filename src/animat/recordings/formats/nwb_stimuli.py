@@ -171,10 +171,7 @@ def _electrodes_in_rows(file: Hdf5File, at: str, rows: Column) -> Column | None:
 
 
 def _of_series(file: Hdf5File, at: str) -> Column:
-    """The time of each pulse of a series: each entry that is not 0 (all if all are 0), or each onset if sampled.
-
-    A series is sampled if it has a rate, or a timestamp every millisecond or more often.
-    """
+    """The time of each pulse of a series: each entry that is not 0 (all if all are 0), or each onset if sampled."""
     if file.has(f"{at}/timestamps"):
         time_s = file.read(f"{at}/timestamps").reshape(-1)
         node, kind = file.node(f"{at}/data"), file.attribute(at, "neurodata_type")
@@ -185,6 +182,7 @@ def _of_series(file: Hdf5File, at: str) -> Column:
         if data.dtype.kind == "U":
             return time_s
         step_s = float(np.ptp(time_s)) / len(time_s) if len(time_s) else 0.0
+        # Sampled, though it states no rate.
         if kind != "IntervalSeries" and 0 < step_s < APART_S:
             return np.asarray(time_s[_onsets(file, f"{at}/data", 1 / step_s).astype(np.int64)])
         # Where a digital input is recorded, a negative number is the end of a pulse.
