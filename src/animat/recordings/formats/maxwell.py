@@ -151,8 +151,7 @@ def _old(file: Hdf5File) -> _Layout:
 def _count_frames(layout: _Layout, ends: list[tuple[int, int, int]]) -> None:
     """State the first frame and how many there are, from those of each group: its first, its last and how many."""
     layout.first_frame = min(first for first, _, _ in ends)
-    frames = max(last for _, last, _ in ends) - layout.first_frame + 1
-    layout.frames = frames if frames > 0 else None
+    layout.frames = max(last for _, last, _ in ends) - layout.first_frame + 1
     lost = max(last - first + 1 - n for first, last, n in ends)
     if lost > 0:
         message = f"{lost:,} frames ({lost / layout.rate_hz:.3g} s) are missing from the recording"
@@ -185,9 +184,8 @@ def _events(file: Hdf5File, layout: _Layout, stimuli: str | None) -> tuple[Colum
         if left := int(np.count_nonzero(~is_stimulus)):
             message = f"{left:,} events of other types than {which} are left out"
             layout.findings.append(Finding("events-left-out", "note", message, float(left)))
-    columns = {}
-    if "eventmessage" in names:
-        columns = stimulus_columns(file.read(at, "eventmessage")[is_stimulus].tolist())
+    texts = file.read(at, "eventmessage")[is_stimulus].tolist() if "eventmessage" in names else []
+    columns = stimulus_columns(texts)
     if "eventid" in names and "stimulus_pattern" not in columns:
         identity = file.read(at, "eventid")[is_stimulus].astype(np.int64)
         # Numbers of which none comes twice count the events.
