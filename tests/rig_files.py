@@ -94,15 +94,21 @@ def write_old_maxwell(
     spikes: np.ndarray | None,
     bits: np.ndarray | None,
     sig: np.ndarray | None = None,
+    lost: int = 0,
 ) -> Path:
-    """A file of version 20160704: 1,024 channels and four rows more, the last two the frame number."""
+    """A file of version 20160704: 1,024 channels and four rows more, the last two the frame number.
+
+    Half way, so many frames are lost.
+    """
     with h5py.File(path, "w") as file:
         file["version"] = np.array([b"20160704"])
         file["mapping"] = mapping
         file["settings/lsb"] = np.array([6.3e-6])
         if sig is None:
             sig = np.zeros((1028, 100), "<u2")
-        sig[-2, :], sig[-1, :] = FIRST_FRAME & 0xFFFF, FIRST_FRAME >> 16
+        at = np.arange(sig.shape[1])
+        frame = FIRST_FRAME + at + lost * (at >= len(at) // 2)
+        sig[-2, :], sig[-1, :] = frame & 0xFFFF, frame >> 16
         file["sig"] = sig
         if spikes is not None:
             file["proc0/spikeTimes"] = spikes

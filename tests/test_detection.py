@@ -589,6 +589,9 @@ def test_noise_is_in_microvolts_where_each_channel_has_its_own_conversion(tmp_pa
     traces, _ = open_traces(tmp_path / "a.nwb")
     np.testing.assert_allclose(detect_spikes(traces, np.empty(0), Detection()).noise_uv, expected, rtol=1e-5)
     with h5py.File(tmp_path / "a.nwb", "r+") as file:
+        file["acquisition/traces/data"].attrs["conversion"] = -1e-6
+    assert np.array_equal(open_traces(tmp_path / "a.nwb")[0].read_uv(0, 9), -traces.read_uv(0, 9))
+    with h5py.File(tmp_path / "a.nwb", "r+") as file:
         del file["acquisition/traces/channel_conversion"]
         file["acquisition/traces/channel_conversion"] = np.ones(3)
     with pytest.raises(InvalidFile, match="expected a conversion of each of the 2 traces, got 3"):
@@ -646,7 +649,11 @@ def test_traces_that_begin_before_0_keep_stimuli_to_their_end(tmp_path: Path) ->
     # A duration that rounds to before the last stimulus.
     write_nwb_traces(tmp_path / "b.nwb", voltage, start_s=-1.6805853027283018)
     write_stimuli(tmp_path / "b.nwb", [7.768889504673502])
-    assert read_traces(tmp_path / "b.nwb", Detection()).stimuli.time_s.tolist() == [7.768889504673502]
+    late = read_traces(tmp_path / "b.nwb", Detection())
+    assert late.stimuli.time_s.tolist() == [7.768889504673502]
+    (outside,) = [finding.message for finding in late.findings if finding.name == "stimuli-outside"]
+    assert outside.startswith("1 of 1 stimuli are outside the traces, from -1.68059 to 4.31941 s")
+    assert "stimuli-outside" not in {finding.name for finding in recording.findings}
 
 
 def test_traces_far_from_0_make_a_recording_of_their_span(tmp_path: Path) -> None:

@@ -139,6 +139,9 @@ def test_each_pattern_is_one_sequence_that_stays_on_the_device(rig: Rig) -> None
         assert len(set(rig.sent)) == 2
         assert rig.sent[0] == rig.sent[2] == rig.sent[4]
         assert len(rig.sequences) == 2
+        # The event that a sequence writes names its pattern, or none.
+        culture.deliver([Stimulus(0.0, electrodes, BALANCED_PULSE, 20.0)], 0.05)
+        assert [parse_line(text).get("pattern") for _, text in rig.events] == [0, 1, 0, 1, 0, None]
     assert rig.sequences == {}
 
 

@@ -68,6 +68,17 @@ def test_spikes_out_of_order_are_those_with_a_later_one_anywhere_before_them(tim
     assert f"in the file: {behind} of" in said(read_recording(path)).get("unsorted-spikes", "in the file: 0 of")
 
 
+def test_recordings_joined_in_one_file_cause_a_warning(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    spike_s, stimulus_s = np.sort(rng.uniform(0, 60, (3, 500))), np.tile(np.arange(1, 59.0), (3, 1))
+    joined = {"spike_channel": rng.integers(0, 9, 1500), "spike_time_s": spike_s.ravel()}
+    found = said(read_recording(npz(tmp_path, **joined, stimulus_time_s=stimulus_s.ravel())))
+    assert "both go back by more than 1 s, 2 of each" in found["times-go-back"]
+    # Listed by channel, spikes go back too, and stimuli listed by condition, but hardly ever as often.
+    for stimuli in (stimulus_s[0], stimulus_s[:2].ravel() + np.repeat([0, 0.5], 58)):
+        assert "times-go-back" not in said(read_recording(npz(tmp_path, **joined, stimulus_time_s=stimuli)))
+
+
 @pytest.mark.parametrize(
     ("changed", "words"),
     [

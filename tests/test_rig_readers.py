@@ -136,11 +136,15 @@ def test_maxwell_events_without_patterns_in_their_text_have_their_number(tmp_pat
         ("frequency 6", [3, 3, 3], [UNKNOWN] * 3),
     ):
         events = event_table([0.1, 0.2, 0.3], [words] * 3)
-        events["eventid"] = numbers
         given: dict[str, Any] = {"mapping": TABLE, "spikes": spike_table([0.5], [9]), "events": events, "recorded": [9]}
+        events["eventid"] = numbers
         recording = read_recording(write_maxwell(tmp_path / f"{words}.h5", **given))
         assert recording.stimuli.pattern.tolist() == pattern
         assert ("stimulus_pattern" in recording.provenance) == (words == "frequency 5")
+        # The vendor's examples, and animat, count the events.
+        events["eventid"] = [1, 2, 3]
+        counted = read_recording(write_maxwell(tmp_path / f"{words} counted.h5", **given))
+        assert counted.stimuli.pattern.tolist() == (pattern if words == "pattern 1" else [UNKNOWN] * 3)
 
 
 def test_what_is_in_the_text_of_some_pulses_only_is_not_guessed() -> None:
@@ -212,6 +216,8 @@ def test_numbers_in_the_text_of_events_are_read_whole(tmp_path: Path) -> None:
     np.testing.assert_array_equal(stimuli.frequency_hz, [20, 20, np.nan])
     assert stimuli.electrodes.tolist() == [[909, -1, -1], [-1, -1, -1], [909, 23923, 7]]
     assert stimuli.pattern.tolist() == [-1, -1, 3]
+    words = ["electrodes 9 7 0.5 mA", "electrodes: 9, 7; pattern 2", "electrode 9 electrode 7", "electrode 9 20 Hz"]
+    assert stimulus_columns(words)["stimulus_electrodes"].tolist() == [[9, 7], [9, 7], [9, 7], [9, -1]]
 
 
 def test_maxwell_raw_without_the_plugin_spikes_still_read(tmp_path: Path) -> None:
@@ -234,8 +240,8 @@ def test_old_maxwell_reads_bits_as_stimuli(tmp_path: Path) -> None:
     bits = np.zeros(5, BITS)
     bits["frameno"] = FIRST_FRAME + np.array([2000, 2100, 4000, 4100, 4200])
     bits["bits"] = [1, 0, 2, 2, 0]
-    path = write_old_maxwell(tmp_path / "a.h5", mapping=TABLE, spikes=spike_table([0.11, 0.21], [9, 3]), bits=bits)
-    recording = read_recording(path)
+    given: dict[str, Any] = {"mapping": TABLE, "spikes": spike_table([0.11, 0.21], [9, 3]), "bits": bits}
+    recording = read_recording(write_old_maxwell(tmp_path / "a.h5", **given))
     assert recording.stimuli.time_s.tolist() == [0.1, 0.2]
     assert recording.stimuli.pattern.tolist() == [1, 2]
     assert recording.spike_times_s.tolist() == [0.11, 0.21]
@@ -244,12 +250,17 @@ def test_old_maxwell_reads_bits_as_stimuli(tmp_path: Path) -> None:
     bits["bits"] = [1, 0, 1, 1, 0]
     path = write_old_maxwell(tmp_path / "b.h5", mapping=TABLE, spikes=spike_table([0.11], [9]), bits=bits)
     assert read_recording(path).stimuli.pattern.tolist() == [UNKNOWN] * 2
+    assert "frames-lost" not in found(recording)
+    some_lost = read_recording(write_old_maxwell(tmp_path / "b.h5", **given, lost=9900))
+    assert (some_lost.start_s, some_lost.stop_s) == (0.0, 0.5)
+    assert found(some_lost)["frames-lost"].startswith("9,900 frames (0.495 s) are missing")
 
 
 # --- CL1 -------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("start", [0, 90_000_000])
+# Frames that count from the start of the rig, also if that was less long before than the recording lasts.
+@pytest.mark.parametrize("start", [0, 90_000_000, 240_000])
 def test_cl1_spikes_and_stimuli_with_parameters_from_the_data_stream(tmp_path: Path, start: int) -> None:
     mark = tmp_path / "unpickled"
     path = write_cl1(
@@ -345,6 +356,10 @@ def other_nwb(path: Path, electrodes: bool = True, stimuli: tuple[str, ...] = ("
             for at in (1000, 9000):
                 data[at : at + 4], data[at + 4 : at + 8] = -1.0, 1.0
             nwb.add_stimulus(pynwb.TimeSeries(name=name, data=data, rate=10_000.0, starting_time=1.0, unit="V"))
+        elif name == "line_ttl":
+            # As Open Ephys writes it: the number of the line, negative where it falls.
+            data, times_s = np.array([1, -1, 2, -2, 1], np.int8), [0.1, 0.11, 0.4, 0.41, 0.9]
+            nwb.add_acquisition(pynwb.TimeSeries(name=name, data=data, timestamps=times_s, unit="n/a"))
         else:
             nwb.add_acquisition(pynwb.TimeSeries(name=name, data=[1.0, 1.0], timestamps=[0.1, 0.9], unit="V"))
     with pynwb.NWBHDF5IO(str(path), "w") as nwb_io:
@@ -427,6 +442,23 @@ def test_other_nwb_columns_with_other_values_than_ours(
         assert recording.provenance["patterns"] == "0: 0.1, 1: 0.5"
 
 
+def test_other_nwb_lasts_as_long_as_its_units_were_observed(tmp_path: Path) -> None:
+    path = other_nwb(tmp_path / "a.nwb")
+    for spike_s, observed, span_s in (
+        ([105.0, 120.0, 119.0], [[101.0, 110.0], [115.0, 121.5]], (100.5, 121.5)),
+        # Intervals that leave out spikes are on another clock, or of some units only.
+        ([105.0, 120.0, 129.0], [[101.0, 110.0], [115.0, 121.5]], (0.0, 129.0)),
+        ([105.0, 120.0, 119.0], [[np.nan, np.inf]], (0.0, 120.0)),
+    ):
+        with h5py.File(path, "r+") as file:
+            file["units/spike_times"][...] = spike_s
+            file["stimulus/presentation/pulses/start_time"][...] = [100.5, 110.0]
+            file["units"].pop("obs_intervals", None)
+            file["units/obs_intervals"] = observed
+        recording = read_recording(path)
+        assert (recording.start_s, recording.stop_s) == span_s
+
+
 def test_other_nwb_units_without_electrodes(tmp_path: Path) -> None:
     recording = read_recording(other_nwb(tmp_path / "a.nwb", electrodes=False))
     assert len(recording.channels) == 3
@@ -435,10 +467,22 @@ def test_other_nwb_units_without_electrodes(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "times_s"), [("events", [0.1, 0.3]), ("wave", [1.1, 1.9]), ("stim_ttl", [0.1, 0.9]), ("lever", [])]
+    ("name", "times_s"),
+    [
+        ("events", [0.1, 0.3]),
+        ("wave", [1.1, 1.9]),
+        ("stim_ttl", [0.1, 0.9]),
+        ("line_ttl", [0.1, 0.4, 0.9]),
+        ("lever", []),
+    ],
 )
 def test_other_nwb_stimuli_in_series(tmp_path: Path, name: str, times_s: list[float]) -> None:
-    np.testing.assert_allclose(read_recording(other_nwb(tmp_path / "a.nwb", stimuli=(name,))).stimuli.time_s, times_s)
+    path = other_nwb(tmp_path / "a.nwb", stimuli=(name,))
+    np.testing.assert_allclose(read_recording(path).stimuli.time_s, times_s)
+    if name == "events":
+        with h5py.File(path, "r+") as file:
+            file["stimulus/presentation/events"].attrs["neurodata_type"] = "IndexSeries"
+        assert read_recording(path).stimuli.time_s.tolist() == [0.1, 0.2, 0.3]
 
 
 @pytest.mark.parametrize(
@@ -476,8 +520,13 @@ def test_a_sampled_stimulus_begins_each_time_it_leaves_0(of: str, times_s: list[
         nwb.add_stimulus(pynwb.TimeSeries(name="wave", rate=float(rate_hz), starting_time=0.0, unit="mV", **stored))
         wave = {**stored, "data": np.take(stored["data"], [900, 950, 1000], mode="clip"), "timestamps": [0.1, 0.2, 0.3]}
         nwb.add_acquisition(pynwb.TimeSeries(name="each", unit="mV", **wave))
+        nwb.add_acquisition(
+            pynwb.TimeSeries(name="timed", unit="mV", timestamps=3.0 + np.arange(rate_hz) / rate_hz, **stored)
+        )
         nwb_io.write(nwb)
     np.testing.assert_allclose(read_recording(path).stimuli.time_s, times_s)
+    if of != "samples 2 ms apart":
+        np.testing.assert_allclose(read_recording(path, stimuli="timed").stimuli.time_s, 3.0 + np.array(times_s))
     if of not in ("noise", "steps of a converter", "samples 2 ms apart"):
         np.testing.assert_allclose(read_recording(path, stimuli="each").stimuli.time_s, [0.3])
 

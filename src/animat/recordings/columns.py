@@ -64,6 +64,15 @@ class PlainColumns:
         noted = [*findings]
         spike_time_s, in_time = _in_time("spike_time_s", self.spike_time_s, "spikes", noted)
         stimulus_time_s, stimuli_in_time = _in_time("stimulus_time_s", self.stimulus_time_s, "stimuli", noted)
+        # Events that passed each other on their way to a file are closer together.
+        each = (np.asarray(times_s, np.float64) for times_s in (self.spike_time_s, self.stimulus_time_s))
+        n, of_stimuli = (int(np.count_nonzero(np.diff(times_s) < -1.0)) for times_s in each)
+        if 0 < n == of_stimuli:
+            message = (
+                f"times of spikes and of stimuli both go back by more than 1 s, {n:,} of each: if these are "
+                "several recordings in one file, their events are mixed now; convert each by itself (--start-min)"
+            )
+            noted.append(Finding("times-go-back", "warning", message, float(n)))
         channels, rows = self._channels(len(spike_time_s), noted)
         if self.start_s is None:
             noted += late_start(spike_time_s, stimulus_time_s)

@@ -209,6 +209,12 @@ def _with_detected_spikes(
         f"{band}, {settings.threshold:g} x median noise, dead time {settings.dead_time_ms:g} ms, blanked "
         f"{settings.blank_ms[0]:g} ms before to {settings.blank_ms[1]:g} ms after stimuli"
     )
+    n, stop_s = len(base.stimuli), traces.start_s + traces.samples / traces.sampling_rate_hz
+    findings = [*base.findings, *detected.findings]
+    if outside := n - np.count_nonzero((base.stimuli.time_s >= traces.start_s) & (base.stimuli.time_s < stop_s)):
+        where = f"the traces, from {traces.start_s:g} to {stop_s:g} s: their responses are counted as empty"
+        message = f"{outside:,} of {n:,} stimuli are outside {where}; remove them, or correct their times"
+        findings.append(Finding("stimuli-outside", "warning", message, float(outside)))
     # Rounding may put a spike's sample an ulp outside the span.
     time_s = np.clip(detected.time_s, base.start_s, base.stop_s)
     return replace(
@@ -217,5 +223,5 @@ def _with_detected_spikes(
         spike_channels=detected.channel,
         sampling_rate_hz=traces.sampling_rate_hz,
         provenance={**base.provenance, "spikes": how},
-        findings=merged((*base.findings, *detected.findings)),
+        findings=merged(findings),
     )

@@ -38,7 +38,7 @@ class Sequences:
 
     def __init__(self, mx: Any, unit_of: Mapping[int, int], lsb_mv: float) -> None:
         self._mx, self._unit_of, self._lsb_mv = mx, unit_of, lsb_mv
-        self._kept: dict[tuple[tuple[int, ...], Pulse], Any] = {}
+        self._kept: dict[tuple[tuple[int, ...], int, Pulse], Any] = {}
         self._passing: list[Any] = []
         self._numbers, self._events = count(1), count(1)
 
@@ -48,7 +48,7 @@ class Sequences:
             # A sequence leaves the device with its last reference; those of earlier deliveries are no longer running.
             self._passing = [*self._passing[-100:], self._build(stimuli, is_kept=False)]
             return self._passing[-1]
-        key = stimuli[0].electrodes, stimuli[0].pulse
+        key = stimuli[0].electrodes, stimuli[0].pattern, stimuli[0].pulse
         if key not in self._kept:
             if len(self._kept) >= MOST_KEPT:
                 self.delete()

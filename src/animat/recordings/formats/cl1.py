@@ -81,13 +81,13 @@ def read_cl1(file: Hdf5File, *, spikes: bool = True) -> Recording:
 def _first_frame(file: Hdf5File, spike: Column, stimulus: Column) -> int:
     """The frame of time 0: 0, or the recording's first frame if frames count from the start of the rig.
 
-    Which one is stated by a pickle, which is not opened; so it is inferred: no frame lies before the start.
+    Which one is stated by a pickle, which is not opened; so it is inferred: none lies before the start, and the last
+    one beyond the number of frames.
     """
     start, frames = file.attribute("/", "start_timestamp"), file.attribute("/", "duration_frames")
-    if not isinstance(start, int) or not isinstance(frames, int) or not 0 < frames < start:
-        return 0
-    lowest = min((int(f.min()) for f in (spike, stimulus) if len(f)), default=0)
-    return start if lowest >= start else 0
+    every = np.concatenate([spike, stimulus])
+    is_stated = isinstance(start, int) and isinstance(frames, int) and 0 < frames < every.max(initial=0)
+    return start if is_stated and every.min() >= start else 0
 
 
 def _stimuli(file: Hdf5File) -> tuple[Column, dict[str, Any]]:

@@ -8,7 +8,7 @@ import h5py
 import numpy as np
 
 from animat.errors import InvalidFile, some_of
-from animat.recordings.columns import Column, PlainColumns, count_out_of_order, unsorted_finding
+from animat.recordings.columns import Column, PlainColumns, count_out_of_order, duration_between, unsorted_finding
 from animat.recordings.findings import Finding
 from animat.recordings.formats.hdf5 import Hdf5File
 from animat.recordings.formats.nwb_layout import ELECTRODES_TABLE, SUBJECT, UNITS_TABLE
@@ -39,6 +39,7 @@ def read_foreign_nwb(file: Hdf5File, stimuli: str | None, *, spikes: bool = True
         channels = _electrodes(file) or {"channel_label": np.empty(0, np.str_)}
         columns = {"spike_time_s": np.empty(0), "spike_channel": np.empty(0, np.int64), **channels}
     columns |= read_stimuli(file, stimuli, findings)
+    columns |= _observed(file, columns["spike_time_s"], columns["stimulus_time_s"])
     provenance = {"source": file.path.name, "format": "NWB of another program", **_origin(file)}
     if spikes:
         provenance["channels"] = "units"
@@ -74,6 +75,18 @@ def _units(file: Hdf5File, findings: list[Finding]) -> dict[str, Any]:
     electrode[known] = table["channel_electrode"][row[known]]
     xy_um[known] = table["channel_xy_um"][row[known]]
     return columns | {"channel_electrode": electrode, "channel_xy_um": xy_um}
+
+
+def _observed(file: Hdf5File, spike_s: Column, stimulus_s: Column) -> dict[str, float]:
+    """When the recording starts and how long it is, if intervals in which units were observed cover all spikes."""
+    at = f"{UNITS_TABLE}/obs_intervals"
+    edge_s = file.read(at).astype(np.float64) if file.has(at) else np.empty(0)
+    edge_s = edge_s[np.isfinite(edge_s)]
+    if not len(edge_s) or not len(spike_s) or np.any(spike_s.clip(edge_s.min(), edge_s.max()) != spike_s):
+        return {}
+    every_s = np.concatenate([edge_s, stimulus_s])
+    start_s = float(every_s.min())
+    return {"start_s": start_s, "duration_s": duration_between(start_s, float(every_s.max()))}
 
 
 def _electrode_of_unit(file: Hdf5File, n: int) -> Column | None:

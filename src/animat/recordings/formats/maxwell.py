@@ -74,9 +74,7 @@ def read_maxwell(
             f"{file.path}: expected spikes at /{layout.spikes}, found none: the rig kept raw traces only, or nothing; "
             "detect spikes in them with animat convert --raw"
         )
-    spike_frame, spike_channel = np.empty((2, 0), np.int64)
-    if spikes:
-        spike_frame, spike_channel = file.columns(layout.spikes, "frameno", "channel")
+    spike_frame, spike_channel = file.columns(layout.spikes, "frameno", "channel") if spikes else np.empty((2, 0), int)
     stimulus_frame, columns = np.empty(0, np.int64), dict[str, Any]()
     if file.has(layout.stimuli):
         stimulus_frame, columns = _bits(file, layout) if is_old(file) else _events(file, layout, stimuli)
@@ -121,14 +119,7 @@ def _new(file: Hdf5File, part: str | None) -> _Layout:
     if recorded := [file.read(f"{group}/channels") for group in groups if file.has(f"{group}/channels")]:
         layout.recorded_channels = np.unique(np.concatenate(recorded).astype(np.int64))
     if ends := [e for group in groups if (e := file.ends(f"{group}/frame_nos")) is not None]:
-        layout.first_frame = min(first for first, _, _ in ends)
-        frames = max(last for _, last, _ in ends) - layout.first_frame + 1
-        layout.frames = frames if frames > 0 else None
-        lost = max(last - first + 1 - n for first, last, n in ends)
-        if lost > 0:
-            message = f"{lost:,} frames ({lost / layout.rate_hz:.3g} s) are missing from the recording"
-            severity: Severity = "warning" if lost > 0.001 * max(n for _, _, n in ends) else "note"
-            layout.findings.append(Finding("frames-lost", severity, message, float(lost)))
+        _count_frames(layout, ends)
     if len(recordings) > 1:
         layout.provenance["part"] = name
     # Only the number of a well tells the cultures of one plate apart; it comes first or last.
@@ -149,12 +140,23 @@ def _old(file: Hdf5File) -> _Layout:
     sig = file.node("sig")
     if sig is not None and len(getattr(sig, "shape", ())) == 2 and sig.shape[0] > OLD_CHANNELS and sig.shape[1]:
         dataset = file.dataset("sig")
+        layout.frames = n = int(dataset.shape[1])
         if not unavailable_filters(dataset):
-            low, high = (int(value) for value in dataset[-2:, 0])
-            layout.first_frame = high << 16 | low
-        layout.frames = int(dataset.shape[1])
+            first, last = (int(high) << 16 | int(low) for low, high in (dataset[-2:, 0], dataset[-2:, n - 1]))
+            _count_frames(layout, [(first, max(last, first + n - 1), n)])
     layout.provenance["layout"] = f"version {OLD_VERSION}"
     return layout
+
+
+def _count_frames(layout: _Layout, ends: list[tuple[int, int, int]]) -> None:
+    """State the first frame and how many there are, from those of each group: its first, its last and how many."""
+    layout.first_frame = min(first for first, _, _ in ends)
+    layout.frames = max(last for _, last, _ in ends) - layout.first_frame + 1
+    lost = max(last - first + 1 - n for first, last, n in ends)
+    if lost > 0:
+        message = f"{lost:,} frames ({lost / layout.rate_hz:.3g} s) are missing from the recording"
+        severity: Severity = "warning" if lost > 0.001 * max(n for _, _, n in ends) else "note"
+        layout.findings.append(Finding("frames-lost", severity, message, float(lost)))
 
 
 def _bits(file: Hdf5File, layout: _Layout) -> tuple[Column, dict[str, Any]]:
@@ -182,12 +184,12 @@ def _events(file: Hdf5File, layout: _Layout, stimuli: str | None) -> tuple[Colum
         if left := int(np.count_nonzero(~is_stimulus)):
             message = f"{left:,} events of other types than {which} are left out"
             layout.findings.append(Finding("events-left-out", "note", message, float(left)))
-    columns = {}
-    if "eventmessage" in names:
-        columns = stimulus_columns(file.read(at, "eventmessage")[is_stimulus].tolist())
+    texts = file.read(at, "eventmessage")[is_stimulus].tolist() if "eventmessage" in names else []
+    columns = stimulus_columns(texts)
     if "eventid" in names and "stimulus_pattern" not in columns:
         identity = file.read(at, "eventid")[is_stimulus].astype(np.int64)
-        if len(np.unique(identity)) > 1 and np.all(identity >= 0):
+        # Numbers of which none comes twice count the events.
+        if 1 < len(np.unique(identity)) < len(identity) and np.all(identity >= 0):
             columns["stimulus_pattern"] = identity
             layout.provenance["stimulus_pattern"] = "the events' eventid"
     return frame[is_stimulus], columns

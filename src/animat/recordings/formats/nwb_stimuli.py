@@ -174,14 +174,20 @@ def _of_series(file: Hdf5File, at: str) -> Column:
     """The time of each pulse of a series: each entry that is not 0 (all if all are 0), or each onset if sampled."""
     if file.has(f"{at}/timestamps"):
         time_s = file.read(f"{at}/timestamps").reshape(-1)
-        node = file.node(f"{at}/data")
-        if not isinstance(node, h5py.Dataset) or node.shape != time_s.shape:
+        node, kind = file.node(f"{at}/data"), file.attribute(at, "neurodata_type")
+        # In an IndexSeries, 0 is the first of the things that are presented.
+        if not isinstance(node, h5py.Dataset) or node.shape != time_s.shape or kind == "IndexSeries":
             return time_s
         data = file.read(f"{at}/data")
         if data.dtype.kind == "U":
             return time_s
-        is_interval = file.attribute(at, "neurodata_type") == "IntervalSeries"
-        is_pulse = data > 0 if is_interval else _from_zero(file, f"{at}/data", data) != 0
+        step_s = float(np.ptp(time_s)) / len(time_s) if len(time_s) else 0.0
+        # Sampled, though it states no rate.
+        if kind != "IntervalSeries" and 0 < step_s < APART_S:
+            return np.asarray(time_s[_onsets(file, f"{at}/data", 1 / step_s).astype(np.int64)])
+        # Where a digital input is recorded, a negative number is the end of a pulse.
+        has_ends = kind == "IntervalSeries" or (data.dtype.kind == "i" and not at.startswith(FIRST))
+        is_pulse = data > 0 if has_ends and np.any(data > 0) else _from_zero(file, f"{at}/data", data) != 0
         return np.asarray(time_s[is_pulse] if np.any(is_pulse) else time_s)
     rate_hz, start_s = file.attribute(f"{at}/starting_time", "rate"), file.first(f"{at}/starting_time")
     if not is_positive(rate_hz) or not isinstance(start_s, int | float):

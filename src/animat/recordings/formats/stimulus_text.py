@@ -23,7 +23,9 @@ LONGEST = 4096
 NAMES = {name: name for name in ("frequency_hz", "pattern", "presentation", "electrodes", "order", "pulses")}
 NAMES |= {"frequency": "frequency_hz", "freq": "frequency_hz", "electrode": "electrodes"}
 _MOST_ELECTRODES = 1024
-_PAIR = re.compile(r"([a-z_]+)\s*[=:\s]\s*(-?[\d.]+(?:e[+-]?\d+)?(?:[,+]\d+)*)", re.IGNORECASE)
+_VALUE = r"(-?[\d.]+(?:e[+-]?\d+)?(?:[,+]\d+)*)"
+_PAIR = re.compile(rf"([a-z_]+)\s*[=:\s]\s*{_VALUE}((?:[,;+\s]+\d+(?![.\w]))*)", re.IGNORECASE)
+"""A name and its value; and whole numbers that follow, which belong to it if it is `electrodes`."""
 
 
 def parameters_of(stimulus: Stimulus) -> dict[str, Any]:
@@ -49,10 +51,11 @@ def parse_line(text: str) -> dict[str, Any]:
             return {}
         parameters = {NAMES[key]: value for key, value in read.items() if key in NAMES}
     else:
-        for key, value in _PAIR.findall(text):
+        for key, value, more in _PAIR.findall(text):
             name = NAMES.get(key.lower())
             if name == "electrodes":
-                parameters[name] = re.split("[,+]", value)
+                listed = f"{value} {more}" if key.lower() == name else value
+                parameters[name] = [*parameters.get(name, ()), *re.split(r"[,;+\s]+", listed.strip())]
             elif name:
                 parameters[name] = value
     return parameters

@@ -179,4 +179,5 @@ def _traces(
 
 
 def _number(value: Any, otherwise: float) -> float:
-    return float(value) if is_positive(value) else otherwise
+    # Negative where an amplifier inverts.
+    return float(value) if isinstance(value, int | float) and is_positive(abs(value)) else otherwise
