@@ -442,6 +442,16 @@ def test_other_nwb_stimuli_in_series(tmp_path: Path, name: str, times_s: list[fl
     np.testing.assert_allclose(read_recording(other_nwb(tmp_path / "a.nwb", stimuli=(name,))).stimuli.time_s, times_s)
 
 
+def test_every_entry_of_a_series_is_a_stimulus_if_its_data_are_not_one_number_each(tmp_path: Path) -> None:
+    path = other_nwb(tmp_path / "a.nwb", stimuli=("events",))
+    for data in (np.zeros((3, 2)), None):
+        with h5py.File(path, "r+") as file:
+            del file["stimulus/presentation/events/data"]
+            if data is not None:
+                file["stimulus/presentation/events/data"] = data
+        assert read_hdf5(path).stimuli.time_s.tolist() == [0.1, 0.2, 0.3]
+
+
 @pytest.mark.parametrize(
     ("of", "times_s"),
     [
