@@ -15,6 +15,7 @@ from animat.cultures.devices.cl1 import CL1Culture
 from animat.errors import InvalidArgument, InvalidFile
 from animat.recordings.conversion import read_traces
 from animat.recordings.formats.cl1_layout import SITES
+from animat.recordings.formats.hdf5_formats import read_hdf5
 from animat.recordings.formats.stimulus_text import stimulus_columns
 from animat.recordings.formats.traces import open_traces
 from animat.recordings.quality import recording_findings
@@ -485,6 +486,16 @@ def test_other_nwb_stimuli_in_series(tmp_path: Path, name: str, times_s: list[fl
         assert read_recording(path).stimuli.time_s.tolist() == [0.1, 0.2, 0.3]
 
 
+def test_every_entry_of_a_series_is_a_stimulus_if_its_data_are_not_one_number_each(tmp_path: Path) -> None:
+    path = other_nwb(tmp_path / "a.nwb", stimuli=("events",))
+    for data in (np.zeros((3, 2)), None):
+        with h5py.File(path, "r+") as file:
+            del file["stimulus/presentation/events/data"]
+            if data is not None:
+                file["stimulus/presentation/events/data"] = data
+        assert read_hdf5(path).stimuli.time_s.tolist() == [0.1, 0.2, 0.3]
+
+
 @pytest.mark.parametrize(
     ("of", "times_s"),
     [
@@ -496,9 +507,13 @@ def test_other_nwb_stimuli_in_series(tmp_path: Path, name: str, times_s: list[fl
         ("samples 2 ms apart", [0.1, 0.5, 0.9]),
     ],
 )
-def test_a_sampled_stimulus_begins_each_time_it_leaves_0(of: str, times_s: list[float], tmp_path: Path) -> None:
+def test_a_sampled_stimulus_begins_each_time_it_leaves_0(
+    of: str, times_s: list[float], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     import pynwb
 
+    # Of the second pulse, half is in one block and half in the next.
+    monkeypatch.setattr("animat.recordings.formats.nwb_stimuli._BLOCK", 5004)
     path = other_nwb(tmp_path / "a.nwb", stimuli=())
     rate_hz = 500 if of == "samples 2 ms apart" else 10_000
     data = np.zeros(rate_hz)
@@ -524,7 +539,7 @@ def test_a_sampled_stimulus_begins_each_time_it_leaves_0(of: str, times_s: list[
             pynwb.TimeSeries(name="timed", unit="mV", timestamps=3.0 + np.arange(rate_hz) / rate_hz, **stored)
         )
         nwb_io.write(nwb)
-    np.testing.assert_allclose(read_recording(path).stimuli.time_s, times_s)
+    np.testing.assert_allclose(read_hdf5(path).stimuli.time_s, times_s)
     if of != "samples 2 ms apart":
         np.testing.assert_allclose(read_recording(path, stimuli="timed").stimuli.time_s, 3.0 + np.array(times_s))
     if of not in ("noise", "steps of a converter", "samples 2 ms apart"):
