@@ -15,6 +15,7 @@ from animat.cultures.devices.cl1 import CL1Culture
 from animat.errors import InvalidArgument, InvalidFile
 from animat.recordings.conversion import read_traces
 from animat.recordings.formats.cl1_layout import SITES
+from animat.recordings.formats.hdf5_formats import read_hdf5
 from animat.recordings.formats.stimulus_text import stimulus_columns
 from animat.recordings.formats.traces import open_traces
 from animat.recordings.quality import recording_findings
@@ -135,7 +136,7 @@ def test_maxwell_events_without_patterns_in_their_text_have_their_number(tmp_pat
         assert ("stimulus_pattern" in recording.provenance) == (words == "frequency 5")
         # The vendor's examples, and animat, count the events.
         events["eventid"] = [1, 2, 3]
-        counted = read_recording(write_maxwell(tmp_path / f"{words} counted.h5", **given))
+        counted = read_hdf5(write_maxwell(tmp_path / f"{words} counted.h5", **given))
         assert counted.stimuli.pattern.tolist() == ([UNKNOWN] * 3 if words == "frequency 5" else pattern)
 
 
@@ -232,7 +233,7 @@ def test_old_maxwell_reads_bits_as_stimuli(tmp_path: Path) -> None:
     assert recording.channels.electrode[recording.spike_channels].tolist() == [2000, 1000]
     assert "3 of 5 entries of /bits" in found(recording)["bits-not-rising"]
     assert "frames-lost" not in found(recording)
-    some_lost = read_recording(write_old_maxwell(tmp_path / "b.h5", **given, lost=9900))
+    some_lost = read_hdf5(write_old_maxwell(tmp_path / "b.h5", **given, lost=9900))
     assert (some_lost.start_s, some_lost.stop_s) == (0.0, 0.5)
     assert found(some_lost)["frames-lost"].startswith("9,900 frames (0.495 s) are missing")
 
@@ -432,7 +433,7 @@ def test_other_nwb_lasts_as_long_as_its_units_were_observed(tmp_path: Path) -> N
             file["stimulus/presentation/pulses/start_time"][...] = [100.5, 110.0]
             file["units"].pop("obs_intervals", None)
             file["units/obs_intervals"] = observed
-        recording = read_recording(path)
+        recording = read_hdf5(path)
         assert (recording.start_s, recording.stop_s) == span_s
 
 
@@ -459,7 +460,7 @@ def test_other_nwb_stimuli_in_series(tmp_path: Path, name: str, times_s: list[fl
     if name == "events":
         with h5py.File(path, "r+") as file:
             file["stimulus/presentation/events"].attrs["neurodata_type"] = "IndexSeries"
-        assert read_recording(path).stimuli.time_s.tolist() == [0.1, 0.2, 0.3]
+        assert read_hdf5(path).stimuli.time_s.tolist() == [0.1, 0.2, 0.3]
 
 
 @pytest.mark.parametrize(
@@ -498,7 +499,7 @@ def test_a_sampled_stimulus_begins_each_time_it_leaves_0(of: str, times_s: list[
         nwb.add_acquisition(pynwb.TimeSeries(name="timed", unit="mV", timestamps=3.0 + np.arange(1e4) / 1e4, **stored))
         nwb_io.write(nwb)
     np.testing.assert_allclose(read_recording(path).stimuli.time_s, times_s)
-    np.testing.assert_allclose(read_recording(path, stimuli="timed").stimuli.time_s, 3.0 + np.array(times_s))
+    np.testing.assert_allclose(read_hdf5(path, stimuli="timed").stimuli.time_s, 3.0 + np.array(times_s))
     if of not in ("noise", "steps of a converter"):
         np.testing.assert_allclose(read_recording(path, stimuli="each").stimuli.time_s, [0.3])
 
