@@ -28,9 +28,8 @@ from animat.execution.task import Task, TaskResult, carry_out_alone
 from animat.execution.training import train
 from animat.progress import Silent
 from animat.studies.cultures import run_over_cultures
-from animat.studies.places import RECEIPTS
-from animat.studies.plan import plan_study
-from animat.studies.run import run_study
+from animat.studies.folder import RECEIPTS
+from animat.studies.run import plan_study, run_study
 from animat.studies.source import Source
 from animat.studies.toml import read_study
 

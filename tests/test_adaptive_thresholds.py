@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -162,10 +163,11 @@ def test_a_condition_that_is_no_longer_given_counts_less_and_less(adjusted: Adju
 
 
 def test_whatever_comes_thresholds_are_finite_and_in_order(adjusted: AdjustedRanks) -> None:
-    for x in (-1.0, 1e6):
-        thresholds = AdaptiveThresholds(adjusted)
-        for condition in [*range(5)] * 100:
-            thresholds.add(condition, HistoryState(), np.array(x))
+    # A history may explain more than the whole of a rank, so that a mean of what is left is beyond 0 and 1.
+    for x, came in itertools.product((-1.0, 1e6), (HistoryState(), HistoryState(trace=-2.0), HistoryState(trace=2.0))):
+        thresholds = AdaptiveThresholds(replace(adjusted, slopes=np.ones_like(adjusted.slopes)))
+        for condition in [*range(5)] * 30:
+            thresholds.add(condition, came, np.array(x))
             percentiles = thresholds.percentiles()
             assert np.all(np.isfinite(percentiles)) and np.all(np.diff(percentiles) >= 0)
 

@@ -33,7 +33,7 @@ from animat.robots import host, robot_from_dict, robot_named, robot_to_dict
 from animat.robots.gymnasium import GymnasiumRobot
 from animat.robots.host import Bodies, Snapshot
 from animat.robots.registry import REGISTRY
-from animat.studies.paths import record_paths
+from animat.studies.episodes import record_paths
 from animat.training.folder import describe, expect_trainable
 from animat.training.group import Group
 from animat.training.host import OnHost

@@ -772,6 +772,7 @@ def test_inspect_refuses_its_options_before_the_files(
         ("train --goal higher", "--goal: 'higher': expected avoid"),
         ("inspect --optimum unicycle .", "--optimum: expected one of arm, cartpole"),
         ("record --interval-min -1", "--interval-min: expected more than 0 minutes"),
+        ("reproduce --culture-seed 5-1", "--culture-seed: expected numbers and ranges, such as '1-5, 8', got '5-1'"),
         ("reproduce --workers 0", "--workers: expected at least 1, got 0"),
         ("reproduce --seed -1", "--seed: expected at least 0, got -1"),
         ("live --policies 0", "--policies: expected at least 1, got 0"),

@@ -16,9 +16,15 @@ from animat.errors import InvalidArgument, Mismatch
 from animat.progress import Silent
 from animat.report.results import ContextRow, LostRow
 from animat.stimulation.protocol import CLOSED_LOOP, TWO_COMMANDS
-from animat.studies.context import ContextRun, plan_context_study, run_context_study
+from animat.studies.context import (
+    ContextRun,
+    ContextStudy,
+    RecordCulture,
+    plan_context_study,
+    protocol_for,
+    run_context_study,
+)
 from animat.studies.context_page import summarise_robot, write_context_page
-from animat.studies.context_tasks import ContextStudy, RecordCulture, protocol_for
 
 
 def row(culture: int, robot: str, **known: Any) -> ContextRow:

@@ -282,15 +282,21 @@ def test_a_saturated_channel_is_blanked_until_it_moves_again() -> None:
 def test_a_blank_is_a_straight_line_between_its_sides() -> None:
     trace = np.zeros((2, 4000), np.float32)
     trace[1, 2000:] = 50.0
+    # What is more than ten samples away does not count.
+    trace[1, :1980], trace[1, 2040:] = 30.0, 20.0
+    expected = trace.copy()
+    expected[1, 1989:2031] = np.linspace(0.0, 50.0, 42)
     settings = Detection(blank_ms=(0.5, 1.5))
     # Far from rest only by half of the noise: nothing to fit.
     cleaned = without_artefacts(trace, np.array([2000]), np.full(2, 100.0, np.float32), RATE_HZ, settings)
     assert np.flatnonzero(cleaned.is_blank[1]).tolist() == list(range(1990, 2030))
-    line_uv = np.interp(np.arange(4000), [1989, 2030], [0.0, 50.0])
-    np.testing.assert_allclose(cleaned.voltage_uv, [np.zeros(4000), line_uv], atol=1e-3)
+    np.testing.assert_allclose(cleaned.voltage_uv, expected, atol=1e-3)
     none = Detection(blank_ms=(0.0, 0.0))
-    unchanged = without_artefacts(trace.copy(), np.array([2000]), np.full(2, 100.0, np.float32), RATE_HZ, none)
-    assert np.array_equal(unchanged.voltage_uv, trace) and not unchanged.is_blank.any()
+    # A pulse without a blank changes nothing, nor does one whose blank ends before the stretch or begins after it.
+    for pulse, of_pulse in ((2000, none), (-3000, settings), (5000, settings)):
+        untouched = without_artefacts(trace.copy(), np.array([pulse]), np.full(2, 100.0, np.float32), RATE_HZ, of_pulse)
+        assert np.array_equal(untouched.voltage_uv, trace)
+        assert not (untouched.is_blank.any() or untouched.saturated.any())
 
 
 @pytest.mark.parametrize("amplitude", [1.0, 2.0, 5.0])
@@ -490,12 +496,12 @@ def test_raw_traces_of_a_maxwell_file(tmp_path: Path) -> None:
         mapping=mapping_table([40, 9, 3], [26_399, 2000, 1000]),
         spikes=None,
         events=event_table([0.5], [""]),
-        recorded=[3, 9, 40],
+        recorded=[9, 40, 3],
         raw=raw,
     )
     recording = read_traces(path, Detection())
-    assert recording.channels.label.tolist() == ["3", "9", "40"]
-    assert recording.channels.electrode.tolist() == [1000, 2000, 26_399]
+    assert recording.channels.label.tolist() == ["9", "40", "3"]
+    assert recording.channels.electrode.tolist() == [2000, 26_399, 1000]
     assert (recording.duration_s, len(recording.stimuli)) == (2.0, 1)
     found = DetectedSpikes(recording.spike_times_s, recording.spike_channels, np.empty(0), ())
     hit, missed, false = agreement(found, [at[np.abs(at - 10_000) > 60] for at in truth])
@@ -510,6 +516,34 @@ def test_raw_traces_of_a_maxwell_file(tmp_path: Path) -> None:
     with h5py.File(path, "r+") as file:
         del file["wells/well000/rec0000/events"]
     assert read_traces(path, Detection()).spike_times_s.tolist() == recording.spike_times_s.tolist()
+
+
+def test_after_frames_that_a_maxone_lost_spikes_are_where_they_were(tmp_path: Path) -> None:
+    voltage, _ = noisy(3, 1.0, step_uv=6.3)
+    given = {"mapping": mapping_table([40, 9, 3], [3, 2, 1]), "spikes": None, "events": event_table([0.8], [""])}
+    path = write_maxwell(tmp_path / "a.h5", **given, recorded=[3, 9, 40], raw=(voltage.T + 512).astype("<u2"))
+    whole = read_traces(path)
+    kept = np.delete(np.arange(len(voltage)), np.s_[8000:8600])
+    with h5py.File(path, "r+") as file:
+        groups = file["wells/well000/rec0000/groups"]
+        raw, frames = groups["routed/raw"][:], groups["routed/frame_nos"][:]
+        del groups["routed/raw"], groups["routed/frame_nos"]
+        groups["routed/raw"], groups["routed/frame_nos"] = raw[:, kept], frames[kept]
+        # A group without traces began 400 frames before, and one of a single channel lost none.
+        groups["alone/frame_nos"] = frames[:10] - 400
+        groups["one/channels"], groups["one/raw"], groups["one/frame_nos"] = np.array([3], "<u4"), raw[:1], frames
+    lost, far = read_traces(path), np.abs(whole.spike_times_s - 0.415) > 0.018
+    assert np.count_nonzero(whole.spike_times_s > 0.43) > 3
+    np.testing.assert_allclose(lost.spike_times_s, whole.spike_times_s[far] + 0.02, atol=1e-12)
+    np.testing.assert_array_equal(lost.spike_channels, whole.spike_channels[far])
+    assert (lost.stimuli.time_s.tolist(), lost.stop_s) == ([0.82], 1.02)
+    assert {f.name: f.value for f in lost.findings}.items() >= {"frames-lost": 600.0, "samples-lost": 1800.0}.items()
+    # A number that falls, and one that would make days of it.
+    for place, number in ((-1, 2**40), (5, 0)):
+        with h5py.File(path, "r+") as file:
+            file["wells/well000/rec0000/groups/routed/frame_nos"][place] = number
+        with pytest.raises(InvalidFile, match="expected rising frame_nos for 19,400 samples"):
+            open_traces(path)
 
 
 def test_raw_traces_of_a_cl1_file(tmp_path: Path) -> None:
@@ -587,6 +621,22 @@ def test_raw_traces_of_an_nwb_file(tmp_path: Path) -> None:
         del file["acquisition/others"], file["acquisition/traces/data"]
     with pytest.raises(InvalidFile, match="expected raw traces at /acquisition/traces/data, found none"):
         read_traces(tmp_path / "a.nwb", Detection())
+
+
+def test_traces_of_an_nwb_file_are_on_the_electrodes_that_they_name(tmp_path: Path) -> None:
+    voltage, _ = noisy(2, 0.1, step_uv=1.0)
+    write_nwb_traces(tmp_path / "a.nwb", voltage, start_s=0.0)
+    nowhere = ["0", "1"], [np.nan, np.nan]
+    # The last two name rows that are not in the table.
+    for named, (labels, x_um) in (([2, 0], (["9", "7"], [30.0, 10.0])), ([3, 0], nowhere), ([-1, 0], nowhere)):
+        with h5py.File(tmp_path / "a.nwb", "r+") as file:
+            electrodes = file.require_group("general/extracellular_ephys/electrodes")
+            for name, values in {"id": [7, 8, 9], "rel_x": [10.0, 20.0, 30.0], "rel_y": [0.0, 0.0, 0.0]}.items():
+                electrodes.require_dataset(name, 3, type(values[0]))[:] = values
+            file["acquisition/traces"].require_dataset("electrodes", 2, int)[:] = named
+        channels = open_traces(tmp_path / "a.nwb")[0].channels
+        assert channels.label.tolist() == labels
+        np.testing.assert_array_equal(channels.x_um, x_um)
 
 
 def test_traces_that_begin_before_0_keep_stimuli_to_their_end(tmp_path: Path) -> None:

@@ -189,6 +189,10 @@ def test_a_selection_is_saved_and_read(tmp_path: Path) -> None:
     selection.save(tmp_path / "selection.json")
     assert Selection.load(tmp_path / "selection.json") == selection
     assert hash(Selection.load(tmp_path / "selection.json")) == hash(selection)
+    # One that stimulates places only has no patterns.
+    of_places = Selection(SMALL, selection.recording, selection.stimulation, np.empty((0, 0), np.int64))
+    of_places.save(tmp_path / "places.json")
+    assert Selection.load(tmp_path / "places.json") == of_places
     channels = Channels.on(SMALL, selection.recording)
     assert channels.electrode.tolist() == selection.recording.tolist()
     assert channels.has_positions
@@ -211,6 +215,8 @@ def test_a_selection_is_saved_and_read(tmp_path: Path) -> None:
             Selection.load(tmp_path / "bad.json")
     with pytest.raises(InvalidFile, match="no such file"):
         Selection.load(tmp_path / "none.json")
+    with pytest.raises(InvalidArgument, match=r"selection\.recording: expected 1 dimensions, got \(1, 2\)"):
+        Selection(SMALL, np.array([[first, silent]]), selection.stimulation, selection.patterns)
 
 
 def test_an_invalid_scan_is_refused() -> None:

@@ -26,9 +26,8 @@ from animat.goals.robot import with_goal
 from animat.reality_gap.session_responses import outcomes
 from animat.responses.condition import Condition
 from animat.robots import Cartpole, Navigation
-from animat.studies.episodes import episode_rows, read_episodes, write_episodes
+from animat.studies.episodes import episode_rows, goals_met, read_episodes, write_episodes
 from animat.studies.folder import describe_study
-from animat.studies.goals import goals_met
 from animat.studies.specification import Arm, RobotSpec, Study
 from animat.studies.toml import read_study, study_to_toml
 from animat.training.folder import describe, expect_folder_for, write_description

@@ -32,7 +32,7 @@ from animat.progress import Silent
 from animat.robots import Cartpole
 from animat.studies import run as studies
 from animat.studies.folder import describe_study
-from animat.studies.plan import plan_study
+from animat.studies.run import plan_study
 from animat.studies.source import Source
 from animat.studies.toml import read_study
 from animat.studies.training import TrainGroup as TrainArm

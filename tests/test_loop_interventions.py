@@ -120,11 +120,13 @@ def test_a_goal_is_switched_once_to_that_of_another_start(session: Session) -> N
 def test_a_robot_with_one_goal_has_none_switched_and_yoked_ones_need_a_source(tmp_path: Path) -> None:
     agents = changed(Cartpole())
     assert [agent.name for agent in agents] == ["random spikes", "yoked", "turned round"]
-    with (
-        FakeCulture() as culture,
-        pytest.raises(InvalidArgument, match="expected episodes for 'yoked' to repeat, got none"),
-    ):
-        run_session(culture, loop_of(), agents, tmp_path, episodes=1)
+    # Neither names of others nor a controller without a name has episodes.
+    for yoked in (agents, [Agent("p0", "", AnyCondition(5)), Agent("yoked", "", AnyCondition(5), "yoked")]):
+        with (
+            FakeCulture() as culture,
+            pytest.raises(InvalidArgument, match="expected episodes for 'yoked' to repeat, got none"),
+        ):
+            run_session(culture, loop_of(), yoked, tmp_path, episodes=1)
 
 
 def test_controls_of_a_simulator_are_agents_of_a_loop() -> None:
@@ -140,7 +142,9 @@ def test_controls_of_a_simulator_are_agents_of_a_loop() -> None:
     for name in ("silent", "shuffled"):
         assert agents[name].controller == POLICIES
         assert agents[name].delivery == name
+    # Whoever repeats stimuli, or those of another episode, gets other responses than mixed stimuli do.
     assert [name for name, agent in agents.items() if not agent.calibrates] == [f"constant {x}" for x in "abcde"]
+    assert [agent.name for agent in changed(ROBOT) if not agent.calibrates] == ["yoked"]
 
 
 @jax.tree_util.register_dataclass

@@ -15,7 +15,7 @@ from animat.execution.task import reported
 from animat.folders import read_description
 from animat.report.results import Results
 from animat.studies.results import read_arrays, read_typed
-from animat.tuning.journal import JOURNAL, read_journal
+from animat.tuning.search import JOURNAL, read_journal
 
 NESTED = "[" * 200_000
 

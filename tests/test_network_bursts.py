@@ -11,7 +11,7 @@ from animat.cli import main
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.recording import Recording
 from animat.report.inspection import inspection_text
-from animat.report.raster import draw_spontaneous
+from animat.report.spikes import draw_spontaneous
 from animat.responses.bursts import find_network_bursts
 from animat.responses.inspection import inspect_recording
 from test_responses import recording

@@ -18,8 +18,7 @@ from animat.goals.robot import robot_of
 from animat.recordings.reading import read_recordings
 from animat.responses.extraction import extract_series
 from animat.stimulation.protocol import Protocol
-from animat.studies.plan import plan_study
-from animat.studies.run import run_study
+from animat.studies.run import plan_study, run_study
 from animat.studies.toml import read_study
 from animat.training.folder import describe, expect_folder_for, is_ours
 from animat.training.policy import Policy

@@ -63,8 +63,9 @@ def test_every_electrode_is_in_one_place_and_places_are_as_large(n: int, named: 
     ["thirds", [[1, 2], []], [[1, -2]], [[1.5]], [1, 2], {"left": [1]}, [[True]], [[1, 2], [2, 1]], 3],
 )
 def test_invalid_places_are_refused_and_their_file_is_named(given_: object, tmp_path: Path) -> None:
-    with pytest.raises(InvalidArgument, match=r"^places: expected"):
-        check_places(given_)
+    for value in (given_, [np.array([1, 2]), [3]]):
+        with pytest.raises(InvalidArgument, match=r"^places: expected"):
+            check_places(value)
     file = tmp_path / "places.json"
     file.write_text(json.dumps(given_))
     with pytest.raises(InvalidFile, match=r"places\.json: places: expected"):

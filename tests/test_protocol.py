@@ -170,6 +170,18 @@ def test_a_schedule_needs_the_patterns_that_its_protocol_uses(tmp_path: Path) ->
 def test_a_protocol_with_more_pulses_than_a_recording_can_have_is_refused() -> None:
     with pytest.raises(InvalidArgument, match="pulses: expected at most 10,000,000"):
         Protocol(pulses=10**12)
+    # Two frequencies, four places and 125 trials of 10,000 pulses are as many as can be.
+    most: dict[str, Any] = {"frequencies_hz": (10_000, 5000), "places": "corners", "trials": 125}
+    assert Protocol(**most, pulses=10_000).n_places == 4
+    with pytest.raises(InvalidArgument, match=r"pulses: expected at most 10,000,000 .*, got 10,001,000$"):
+        Protocol(**most, pulses=10_001)
+
+
+def test_a_protocol_of_more_than_a_week_is_refused() -> None:
+    # 403,200 s at 1 Hz, and half of that at 2 Hz.
+    assert Protocol(frequencies_hz=(1, 2), trials=403_200).trials == 403_200
+    with pytest.raises(InvalidArgument, match=r"expected stimuli of at most a week \(604,800 s\) .*, got 6.05e\+05 s"):
+        Protocol(frequencies_hz=(1, 2), trials=403_201)
 
 
 # --- as JSON ----------------------------------------------------------------------------------------------------------

@@ -22,20 +22,17 @@ from animat.report.comparisons import Pair, draw_comparisons
 from animat.report.controls import draw_controls
 from animat.report.headline import draw_headline
 from animat.report.html import Picture, Section, Table, with_links, with_minus, write_page
-from animat.report.learning_curves import LearningCurve, draw_learning_curves, over_rounds
-from animat.report.over_time import Courses, draw_over_time
+from animat.report.over_time import Courses, LearningCurve, draw_learning_curves, draw_over_time, over_rounds
 from animat.report.results import ComparedReturns, ControlReturns, OverCultures, Results, Score, StudyOptimum
 from animat.report.style import save_figure
 from animat.robots import Cartpole
 from animat.studies.arms import arm_differences, arms_table
 from animat.studies.captions import CULTURE, HEADLINE, ROBOT
-from animat.studies.cultures import CulturesRun
-from animat.studies.cultures_page import _describe, _summary
+from animat.studies.cultures import CulturesRun, _describe, _summary
 from animat.studies.differences import decisions, differing_comparisons, explain
+from animat.studies.folder import optima_file
 from animat.studies.optima import kinds_of, kinds_over_time
 from animat.studies.paper import paper_study
-from animat.studies.places import optima_file
-from animat.studies.plan import plan_study
 from animat.studies.publishing import (
     _as_in_paper,
     _colophon,
@@ -48,6 +45,7 @@ from animat.studies.publishing import (
 )
 from animat.studies.report_tables import comparisons_table, controllability_table
 from animat.studies.results import write_typed
+from animat.studies.run import plan_study
 from animat.studies.source import Source
 from animat.studies.specification import Arm, Compared, RobotSpec, Simulators, Study
 from animat.studies.tabulating import AS_IN_PAPER, FIRST, NONE, SECOND, TOO_FEW, outcome_of

@@ -10,10 +10,8 @@ import pytest
 
 from animat.report.comparisons import Pair, draw_comparisons
 from animat.report.controls import draw_controls
-from animat.report.headline import draw_headline
-from animat.report.learning_curves import LearningCurve, draw_learning_curves
-from animat.report.over_cultures import draw_over_cultures
-from animat.report.over_time import Courses, draw_over_time
+from animat.report.headline import draw_headline, draw_over_cultures
+from animat.report.over_time import Courses, LearningCurve, draw_learning_curves, draw_over_time
 from animat.report.results import ControlReturns, OverCultures
 from animat.studies.publishing import _describe
 from test_report_claims import ROW, score

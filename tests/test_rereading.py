@@ -14,7 +14,7 @@ from animat.neurons.history_tracker import AdjustedRanks
 from animat.neurons.memory import MemorySimulator, fit_memory
 from animat.neurons.simulator import fit_empirical
 from animat.reality_gap import Calibration
-from animat.reality_gap.rereading import reread
+from animat.reality_gap.calibration import reread
 from animat.responses.extraction import extract_responses
 from animat.responses.readouts import Readouts
 from animat.responses.responses import Responses

@@ -80,13 +80,16 @@ def test_maxwell_events_with_unknown_text_are_read_without_it(tmp_path: Path) ->
     words = {"frequency_hz": 20, "order": [1, 2], "pulses": {"a": 1}, "electrodes": {"b": 2}, "pattern": "x"}
     path = write_maxwell(
         tmp_path / "a.h5",
-        mapping=TABLE,
-        spikes=spike_table([0.5], [9]),
+        mapping=mapping_table([0, 9, -1, 8], [0, 2000, 7, -1]),
+        spikes=spike_table([0.5], [0]),
         events=event_table([0.2, 0.4], [json.dumps(words)] * 2),
     )
     recording = read_recording(path)
     assert recording.stimuli.frequency_hz.tolist() == [20, 20]
     assert recording.presentation is None
+    # Channels and electrodes count from 0; -1 is none.
+    assert recording.channels.electrode[recording.spike_channels].tolist() == [0]
+    assert recording.channels.label.tolist() == ["0", "9"]
 
 
 def test_maxwell_channels_listed_twice_are_one_channel(tmp_path: Path) -> None:
@@ -127,17 +130,22 @@ def test_maxwell_frames_that_are_missing_are_counted_and_the_clock_starts_with_t
 
 
 def test_maxwell_events_without_patterns_in_their_text_have_their_number(tmp_path: Path) -> None:
-    for words, pattern in (("frequency 5", [3, 8, 3]), ("pattern 1", [1, 1, 1])):
+    for words, numbers, pattern in (
+        ("frequency 5", [3, 8, 3], [3, 8, 3]),
+        ("pattern 1", [3, 8, 3], [1, 1, 1]),
+        # The same for all says nothing.
+        ("frequency 6", [3, 3, 3], [UNKNOWN] * 3),
+    ):
         events = event_table([0.1, 0.2, 0.3], [words] * 3)
         given: dict[str, Any] = {"mapping": TABLE, "spikes": spike_table([0.5], [9]), "events": events, "recorded": [9]}
-        events["eventid"] = [3, 8, 3]
+        events["eventid"] = numbers
         recording = read_recording(write_maxwell(tmp_path / f"{words}.h5", **given))
         assert recording.stimuli.pattern.tolist() == pattern
         assert ("stimulus_pattern" in recording.provenance) == (words == "frequency 5")
         # The vendor's examples, and animat, count the events.
         events["eventid"] = [1, 2, 3]
         counted = read_hdf5(write_maxwell(tmp_path / f"{words} counted.h5", **given))
-        assert counted.stimuli.pattern.tolist() == ([UNKNOWN] * 3 if words == "frequency 5" else pattern)
+        assert counted.stimuli.pattern.tolist() == (pattern if words == "pattern 1" else [UNKNOWN] * 3)
 
 
 def test_what_is_in_the_text_of_some_pulses_only_is_not_guessed() -> None:
@@ -166,6 +174,12 @@ def test_maxwell_is_read_without_groups_or_mapping(tmp_path: Path) -> None:
     recording = read_recording(write_maxwell(tmp_path / "b.h5", mapping=None, spikes=spikes))
     assert recording.channels.electrode.tolist() == [-1, -1]
     assert "the electrodes of channels are not known" in found(recording)["mapping-missing"]
+    assert recording.provenance.keys() >= {"recorded_at"}
+    with h5py.File(tmp_path / "b.h5", "r+") as file:
+        file["wells/well000/rec0000/start_time"][:] = 1_700_000_000_000_000
+        file["wellplate/id"] = np.array([7])
+    # What cannot be a date, or a chip's name, is left out.
+    assert read_recording(tmp_path / "b.h5").provenance.keys().isdisjoint({"recorded_at", "chip_id"})
 
 
 def test_maxwell_without_spikes_says_what_to_do(tmp_path: Path) -> None:
@@ -189,7 +203,9 @@ def test_maxwell_events_of_several_types_are_not_guessed(tmp_path: Path) -> None
     path = write_maxwell(tmp_path / "a.h5", mapping=TABLE, spikes=spike_table([0.5], [9]), events=events, recorded=[9])
     with pytest.raises(InvalidFile, match=r"found 2: 1 \(2 events\), 2 \(1 events\); choose with --stimuli NAME"):
         read_recording(path)
-    stimuli = read_recording(path, stimuli="2").stimuli
+    recording = read_recording(path, stimuli="2")
+    assert found(recording)["events-left-out"] == "2 events of other types than 2 are left out"
+    stimuli = recording.stimuli
     assert (stimuli.frequency_hz.tolist(), stimuli.electrodes.tolist()) == ([20.0], [[909]])
 
 
@@ -232,6 +248,9 @@ def test_old_maxwell_reads_bits_as_stimuli(tmp_path: Path) -> None:
     assert recording.spike_times_s.tolist() == [0.11, 0.21]
     assert recording.channels.electrode[recording.spike_channels].tolist() == [2000, 1000]
     assert "3 of 5 entries of /bits" in found(recording)["bits-not-rising"]
+    bits["bits"] = [1, 0, 1, 1, 0]
+    path = write_old_maxwell(tmp_path / "b.h5", mapping=TABLE, spikes=spike_table([0.11], [9]), bits=bits)
+    assert read_recording(path).stimuli.pattern.tolist() == [UNKNOWN] * 2
     assert "frames-lost" not in found(recording)
     some_lost = read_hdf5(write_old_maxwell(tmp_path / "b.h5", **given, lost=9900))
     assert (some_lost.start_s, some_lost.stop_s) == (0.0, 0.5)
@@ -249,7 +268,8 @@ def test_cl1_spikes_and_stimuli_with_parameters_from_the_data_stream(tmp_path: P
         tmp_path / "a",
         spikes=[(start + 50_000, 8), (start + 25_000, 62)],
         stims=[(start + 1000, 9), (start + 1000, 12), (start + 6000, 9), (start + 11_000, 20)],
-        stream=[(start + 990, packed_text(said(5, 0))), (start + 10_000, packed_text(said(40, 1)))],
+        # The second text is longer than a byte can say.
+        stream=[(start + 990, packed_text(said(5, 0))), (start + 10_000, packed_text(said(40, 1) + 300 * " "))],
         start=start,
         mark=mark,
     )
@@ -293,6 +313,9 @@ def test_cl1_without_stream_stimuli_or_spikes(tmp_path: Path) -> None:
     recording = read_recording(write_cl1(tmp_path / "a.h5", spikes=[(5, 1)], stims=[(1, 2)]))
     assert np.isnan(recording.stimuli.frequency_hz).all()
     assert len(read_recording(write_cl1(tmp_path / "b.h5", spikes=[(5, 1)], stims=None)).stimuli) == 0
+    # Longer than the rig had run before: its frames cannot be told from those of a recording that begins with 0.
+    long = read_recording(write_cl1(tmp_path / "d.h5", spikes=[(50_000, 1)], stims=[(25_000, 2)], start=20_000))
+    assert (long.spike_times_s.tolist(), long.stimuli.time_s.tolist()) == ([2.0], [1.0])
     path = write_cl1(tmp_path / "c.h5", spikes=None, stims=[(1, 2)], samples=np.zeros((10, 64), "<i2"))
     with pytest.raises(InvalidFile, match=r"expected spikes at /spikes.*include_spikes=False.*animat convert --raw"):
         read_recording(path)
@@ -471,14 +494,16 @@ def test_other_nwb_stimuli_in_series(tmp_path: Path, name: str, times_s: list[fl
         ("noise", [0.1, 0.9]),
         ("steps of a converter", [0.1, 0.5, 0.9]),
         ("an offset", [0.1, 0.5, 0.9]),
+        ("samples 2 ms apart", [0.1, 0.5, 0.9]),
     ],
 )
 def test_a_sampled_stimulus_begins_each_time_it_leaves_0(of: str, times_s: list[float], tmp_path: Path) -> None:
     import pynwb
 
     path = other_nwb(tmp_path / "a.nwb", stimuli=())
-    data = np.zeros(10_000)
-    for at, amplitude in ((1000, 300.0), (5000, -100.0), (9000, 200.0)):
+    rate_hz = 500 if of == "samples 2 ms apart" else 10_000
+    data = np.zeros(rate_hz)
+    for at, amplitude in ((rate_hz // 10, 300.0), (rate_hz // 2, -100.0), (rate_hz // 10 * 9, 200.0)):
         data[at : at + 4], data[at + 4 : at + 8] = amplitude, -amplitude
     if of == "noise":
         data += np.random.default_rng(0).normal(0, 20, len(data))
@@ -493,14 +518,17 @@ def test_a_sampled_stimulus_begins_each_time_it_leaves_0(of: str, times_s: list[
         if of == "an offset":
             # As a converter from analog to digital: 2048 is 0.
             stored = {"data": (data + 2048).astype(np.uint16), "conversion": 0.1, "offset": -204.8}
-        nwb.add_stimulus(pynwb.TimeSeries(name="wave", rate=10_000.0, starting_time=0.0, unit="mV", **stored))
-        wave = {**stored, "data": stored["data"][900:1010:50], "timestamps": [0.1, 0.2, 0.3]}
+        nwb.add_stimulus(pynwb.TimeSeries(name="wave", rate=float(rate_hz), starting_time=0.0, unit="mV", **stored))
+        wave = {**stored, "data": np.take(stored["data"], [900, 950, 1000], mode="clip"), "timestamps": [0.1, 0.2, 0.3]}
         nwb.add_acquisition(pynwb.TimeSeries(name="each", unit="mV", **wave))
-        nwb.add_acquisition(pynwb.TimeSeries(name="timed", unit="mV", timestamps=3.0 + np.arange(1e4) / 1e4, **stored))
+        nwb.add_acquisition(
+            pynwb.TimeSeries(name="timed", unit="mV", timestamps=3.0 + np.arange(rate_hz) / rate_hz, **stored)
+        )
         nwb_io.write(nwb)
     np.testing.assert_allclose(read_recording(path).stimuli.time_s, times_s)
-    np.testing.assert_allclose(read_hdf5(path, stimuli="timed").stimuli.time_s, 3.0 + np.array(times_s))
-    if of not in ("noise", "steps of a converter"):
+    if of != "samples 2 ms apart":
+        np.testing.assert_allclose(read_hdf5(path, stimuli="timed").stimuli.time_s, 3.0 + np.array(times_s))
+    if of not in ("noise", "steps of a converter", "samples 2 ms apart"):
         np.testing.assert_allclose(read_recording(path, stimuli="each").stimuli.time_s, [0.3])
 
 

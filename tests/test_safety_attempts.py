@@ -455,6 +455,9 @@ def test_numbers_of_any_type_give_the_right_charge(kind: Any) -> None:
         # As text: it has no frequency, and from Python 3.13 on no record equals another where both have NaN.
         assert str(stimulus) == str(Stimulus(0.0, (100, 101), pulse))
         assert {type(electrode) for electrode in stimulus.electrodes} == {int}
+    made = Stimulus(0.0, (kind(100), kind(101)), pulse, frequency_hz=kind(5), pattern=kind(3), presentation=kind(7))
+    numbers = [*made.electrodes, made.frequency_hz, made.pattern, made.presentation]
+    assert [(type(number), number) for number in numbers] == [(int, 100), (int, 101), (float, 5.0), (int, 3), (int, 7)]
 
 
 def test_an_int8_at_its_edge_is_no_small_amplitude() -> None:

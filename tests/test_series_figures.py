@@ -16,8 +16,7 @@ from animat.recordings.recording import Recording
 from animat.report.array import draw_array, draw_selection
 from animat.report.drift import draw_drift
 from animat.report.inspection import draw_series
-from animat.report.response_histograms import draw_response_histograms
-from animat.report.responses_over_time import draw_responses_over_time
+from animat.report.response_histograms import draw_response_histograms, draw_responses_over_time
 from animat.report.style import MEDIAN, condition_colours
 from animat.responses.conditions import conditions_named
 from animat.responses.extraction import extract_responses

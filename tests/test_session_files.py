@@ -68,8 +68,9 @@ def test_a_killed_session_is_recovered_to_the_bits_that_it_would_have_written(tm
     killed.mkdir()
     (killed / LOG_FILE).write_bytes((tmp_path / "whole" / LOG_FILE).read_bytes())
     leftovers = [killed / ".ticks.csv.abcdefgh.partial.csv", killed / ".session.nwb.abcdefgh.partial.nwb"]
-    others = killed / ".notes.csv.abcdefgh.partial.csv"
-    for leftover in (*leftovers, others):
+    # Another program's file, and what an editor keeps of a table that is open in it.
+    others = [killed / ".notes.csv.abcdefgh.partial.csv", killed / ".ticks.csv.swp"]
+    for leftover in (*leftovers, *others):
         leftover.write_text("half of it")
     recovered = recover_session(killed)
     expected = as_logged(killed)
@@ -83,8 +84,7 @@ def test_a_killed_session_is_recovered_to_the_bits_that_it_would_have_written(tm
     assert recovered.to_dict() == session.to_dict()
     assert recovered.episodes == session.episodes
     # What the killed program was writing is gone, and nothing else.
-    assert [leftover.exists() for leftover in leftovers] == [False, False]
-    assert others.exists()
+    assert [file.exists() for file in (*leftovers, *others)] == [False, False, True, True]
 
 
 def test_a_damaged_log_is_not_written_over_what_holds_more(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -242,9 +242,12 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], byt
         ("start_min", math.nan, "start_min: expected a finite number, got nan"),
         ("start_min", [1.0], "start_min: expected a number, got [1.0]"),
         ("sampling_rate_hz", -1, "sampling_rate_hz: expected a rate above 0 Hz, got -1"),
+        ("sampling_rate_hz", 0.0, "sampling_rate_hz: expected a rate above 0 Hz, got 0.0"),
         ("recorded_at", "yesterday", "recorded_at: expected a date in ISO 8601, got 'yesterday'"),
         ("recorded_at", "2026\0", "recorded_at: expected text without null characters"),
         ("provenance", {"source": 3}, "provenance.source: expected text, got 3"),
+        ("provenance", {"source": "\ud800"}, r"halves of surrogate pairs, got '\ud800'"),
+        ("provenance", {"source": "\udfff"}, r"halves of surrogate pairs, got '\udfff'"),
         ("loop", None, "loop: expected a table, got None"),
         ("loop.pulses", 0, "pulses"),
         ("loop.conditions", "5 Hz", "loop.conditions: expected a list, got '5 Hz'"),

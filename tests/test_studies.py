@@ -48,14 +48,11 @@ from animat.robots import Cartpole, Navigation
 from animat.stimulation.protocol import Protocol, read_protocol
 from animat.stimulation.selection import SelectionRule
 from animat.studies.captions import CULTURE, ROBOT
-from animat.studies.folder import claim_folder, describe_study, hash_files
+from animat.studies.folder import claim_folder, controls_file, describe_study, episodes_file, hash_files, paths_file
 from animat.studies.paper import PRINTED, paper_study
 from animat.studies.pictures import CulturePictures
-from animat.studies.places import controls_file, episodes_file, paths_file
-from animat.studies.plan import plan_study
-from animat.studies.recording import Record
-from animat.studies.run import StudyRun, run_study
-from animat.studies.simulating import Fit
+from animat.studies.recording import Fit, Record
+from animat.studies.run import StudyRun, plan_study, run_study
 from animat.studies.source import Source
 from animat.studies.specification import Arm, Compared, RobotSpec, Simulators, Study
 from animat.studies.toml import read_study, study_to_toml
@@ -433,7 +430,7 @@ def test_sources_of_the_same_name_are_distinguished(tmp_path: Path) -> None:
 @pytest.mark.oracle
 def test_the_first_recording_is_the_first_in_time_not_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """`recording_0010_min` comes before `recording_02.5_min` by name."""
-    monkeypatch.setattr("animat.studies.figures.save_figure", lambda figure, path: path)
+    monkeypatch.setattr("animat.report.style.save_figure", lambda figure, path: path)
     folder = tmp_path / "study"
     for minute, channels in ((2.5, 24), (10.0, 16)):
         made = synthetic_recording(1, patterns=20, channels=channels)

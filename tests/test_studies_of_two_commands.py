@@ -19,9 +19,8 @@ from animat.recordings.reading import read_recordings
 from animat.responses.extraction import extract_series
 from animat.robots import Wheels
 from animat.stimulation.protocol import TWO_COMMANDS
-from animat.studies.recording import Record
+from animat.studies.recording import Fit, Record, controllability
 from animat.studies.run import run_study
-from animat.studies.simulating import Fit, controllability
 from animat.studies.source import Source
 from animat.studies.specification import Arm, Compared, RobotSpec, Simulators, Study
 from animat.studies.task import study_seed
@@ -31,8 +30,7 @@ from animat.training.lessons import Lesson
 from animat.training.policy import Policy
 from animat.training.settings import SAC
 from animat.training.specification import Training
-from animat.tuning.space import with_settings
-from animat.tuning.specification import Tune, tuning_of
+from animat.tuning.specification import Tune, tuning_of, with_settings
 
 NEAR = Lesson(starts={"x_m": (0.4, 0.6)}, until_return=45)
 HERE = Path(__file__).parent

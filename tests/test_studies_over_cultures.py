@@ -25,9 +25,15 @@ from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch, U
 from animat.evaluation.statistics import compare
 from animat.report.results import ComparedReturns, Results, Score
 from animat.studies import cultures
-from animat.studies.cultures import CulturesRun, bootstrap_interval, over_cultures, run_over_cultures, studies_of
-from animat.studies.cultures_page import write_cultures_page
-from animat.studies.places import results_file
+from animat.studies.cultures import (
+    CulturesRun,
+    bootstrap_interval,
+    over_cultures,
+    run_over_cultures,
+    studies_of,
+    write_cultures_page,
+)
+from animat.studies.folder import RESULTS
 from animat.studies.results import write_typed
 from animat.studies.run import StudyRun, run_study
 from animat.studies.source import Source, read_seeds
@@ -176,9 +182,9 @@ def test_a_culture_that_fails_is_reported_and_stops_no_other(tmp_path: Path, mon
 
 
 def run_with_results(study: Study, folder: Path) -> StudyRun:
-    results_file(folder).parent.mkdir(parents=True, exist_ok=True)
+    (folder / RESULTS).parent.mkdir(parents=True, exist_ok=True)
     rows = (compared(0.0, float(study.culture.seed or 0), SECOND),)
-    write_typed(results_file(folder), Results((), rows, (), (), (), ()))
+    write_typed(folder / RESULTS, Results((), rows, (), (), (), ()))
     return StudyRun(folder, folder / "report.html", 1, {})
 
 
@@ -245,9 +251,9 @@ SCORED: dict[str, Any] = {
 
 def run_scored(folder: Path, monkeypatch: pytest.MonkeyPatch) -> CulturesRun:
     def ran(study: Study, folder: Path, **_: Any) -> StudyRun:
-        results_file(folder).parent.mkdir(parents=True, exist_ok=True)
+        (folder / RESULTS).parent.mkdir(parents=True, exist_ok=True)
         scores = tuple(Score(**SCORED | {"mean_return": study.culture.seed + i / 3}) for i in range(2))
-        write_typed(results_file(folder), Results(scores, (), (), (), (), ()))
+        write_typed(folder / RESULTS, Results(scores, (), (), (), (), ()))
         return StudyRun(folder, folder / "report.html", 1, {})
 
     monkeypatch.setattr(cultures, "run_study", ran)
@@ -294,7 +300,7 @@ def test_as_a_user_it_ends_with_the_tables_of_each_culture_alone(
     alone = replace(read_study(TINY), culture=Source("files", files=("other",)))
     run_study(alone, tmp_path / "alone", base=tmp_path)
     both = (tmp_path / "many" / "culture-other", tmp_path / "alone")
-    results = [results_file(folder).read_bytes() for folder in both]
+    results = [(folder / RESULTS).read_bytes() for folder in both]
     assert results[0] == results[1]
     page = (tmp_path / "many" / "report.html").read_text()
     assert "better in" in page and "culture-one/report.html" in page

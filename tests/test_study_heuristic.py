@@ -9,7 +9,7 @@ from scipy.stats import mannwhitneyu
 from animat.evaluation.rollouts import Episodes
 from animat.report.results import Results
 from animat.studies.episodes import RANDOM, episode_rows
-from animat.studies.heuristic import HEURISTIC, NOT, OUTPERFORM, TOO_FEW, compare_with_heuristic, not_outperforming
+from animat.studies.outperforming import HEURISTIC, NOT, OUTPERFORM, TOO_FEW, compare_with_heuristic, not_outperforming
 from animat.studies.specification import Arm, RobotSpec, Study
 from animat.studies.tabulating import performances
 

@@ -11,7 +11,7 @@ from scipy import stats
 
 from animat.report.results import ReflexComparison, StudyOptimum
 from animat.studies.episodes import COUPLING, RANDOM, episode_rows
-from animat.studies.reflex import compare_with_reflex, describe_reflexes
+from animat.studies.outperforming import compare_with_reflex, describe_reflexes
 from animat.studies.specification import Arm, RobotSpec, Study
 from test_study_results import episodes_of
 

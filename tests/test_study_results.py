@@ -27,17 +27,14 @@ from animat.recordings.reading import read_recordings
 from animat.report.results import ComparedReturns, Results, Score, StudyOptimum
 from animat.responses.extraction import extract_series
 from animat.robots import Navigation
-from animat.studies.episodes import COLUMNS, RANDOM, episode_rows, mean_returns, read_episodes, write_episodes
+from animat.studies.episodes import COLUMNS, RANDOM, Paths, episode_rows, mean_returns, read_episodes, write_episodes
 from animat.studies.evaluating import Evaluate
-from animat.studies.figure_tables import write_paths
+from animat.studies.folder import RESULTS, controls_file, episodes_file, optima_file, table_file
 from animat.studies.optima import FindOptima, read_optima
-from animat.studies.paths import Paths
-from animat.studies.pictures import _courses, _minutes_in_training
-from animat.studies.places import controls_file, episodes_file, optima_file, results_file, table_file
-from animat.studies.recording import Record
+from animat.studies.pictures import _courses, _minutes_in_training, write_paths
+from animat.studies.recording import Fit, Record
 from animat.studies.report_tables import optima_table
 from animat.studies.results import read_typed, write_typed
-from animat.studies.simulating import Fit
 from animat.studies.source import Source
 from animat.studies.specification import Arm, Compared, RobotSpec, Study, mapping_label
 from animat.studies.tabulating import References, Tabulate, _controls, _finite, _optimum_error, _scores
@@ -80,7 +77,7 @@ def compared_returns(folder: Path, *comparisons: Compared) -> tuple[ComparedRetu
         optimum = StudyOptimum(spec.name, "none", "moving", 0.0, 20.0, None, None, 0.1, 20.0, 0.1, 20.0, 0.1, 100, None)
         write_typed(optima_file(folder, spec.name), [optimum])
     Tabulate(study).run(folder, Silent())
-    results = read_typed(results_file(folder), Results)
+    results = read_typed(folder / RESULTS, Results)
     with table_file(folder, "comparisons").open(newline="") as file:
         assert [row["u"] for row in csv.DictReader(file)] == [str(row.u) for row in results.comparisons]
     assert not table_file(folder, "goals").exists(), "no robot of the study has a goal"
@@ -426,7 +423,7 @@ def test_a_study_of_a_real_recording_with_two_conditions(
 
     policy = Policy.load(folder / "policies" / "navigation" / "9-thresholds" / "p0.safetensors")
     assert [condition.label for condition in policy.conditions] == ["5 Hz", "10 Hz"]
-    results = read_typed(results_file(folder), Results)
+    results = read_typed(folder / RESULTS, Results)
     optima, scores = {optimum.mapping: optimum for optimum in results.optima}, results.scores
     assert {score.mapping for score in scores} == set(optima) == {"1-threshold", "9-thresholds"}
     for score in scores:

@@ -34,13 +34,11 @@ from animat.training.policy import CURVE
 from animat.training.settings import SAC
 from animat.training.specification import CHUNKS, Training
 from animat.tuning import tasks
-from animat.tuning.journal import JOURNAL, TrialResult, read_journal
 from animat.tuning.results import BEST, HISTORY, RESULTS, Final, TuningResult, write_results
 from animat.tuning.run import tune
-from animat.tuning.side_by_side import Trials
-from animat.tuning.space import Range, first_settings, with_settings
-from animat.tuning.specification import Tuning, read_tuning, tuning_of
-from animat.tuning.tasks import Trial, group_by_shape
+from animat.tuning.search import JOURNAL, TrialResult, read_journal
+from animat.tuning.specification import Range, Tuning, first_settings, read_tuning, tuning_of, with_settings
+from animat.tuning.tasks import Trial, Trials, group_by_shape
 from synthetic_recordings import synthetic_recording
 
 pytest.importorskip("optuna", reason="animat tune needs the extra [tune]")

@@ -11,9 +11,8 @@ import pytest
 from animat.cli import main
 from animat.errors import InvalidFile
 from animat.training.specification import CHUNKS
-from animat.tuning.journal import JOURNAL, read_journal
-from animat.tuning.space import Range, own_settings, with_settings
-from animat.tuning.specification import Tune, read_tuning
+from animat.tuning.search import JOURNAL, read_journal
+from animat.tuning.specification import Range, Tune, own_settings, read_tuning, with_settings
 
 TINY = Path(__file__).parent / "tiny_tuning.toml"
 PLAIN = '[[robots]]\nname = "cartpole"\n[[arms]]\nname = "1 threshold"\n'

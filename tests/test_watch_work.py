@@ -20,9 +20,8 @@ from animat.execution.receipts import Receipt
 from animat.execution.task import NOTICES, UNFINISHED
 from animat.recordings.reading import read_recording
 from animat.responses.inspection import inspect_recording
-from animat.studies.context import plan_context_study
-from animat.studies.context_tasks import ContextStudy
-from animat.studies.plan import plan_study
+from animat.studies.context import ContextStudy, plan_context_study
+from animat.studies.run import plan_study
 from animat.studies.toml import read_study
 from animat.training.policy import CURVE
 from animat.watch.cultures import CulturesView

@@ -162,14 +162,18 @@ def _what_is_left(command: Command) -> str:
     return f"; finished work is kept{'' if isinstance(command, Run | Live) else '; run it again to resume'}"
 
 
-_BUDGET = {"budget.pulses": "budget_pulses", "budget.pulses_per_electrode": "budget_per_electrode"}
+_RENAMED = {
+    "budget.pulses": "budget_pulses",
+    "budget.pulses_per_electrode": "budget_per_electrode",
+    "seeds": "culture_seed",
+}
 """Options whose Python arguments have different names."""
 
 
 def _name_option(command: Command, message: str) -> str:
     """Replace the argument's name at the beginning of a message by the name of its option."""
     argument, _, rest = message.partition(": ")
-    name = _BUDGET.get(argument, argument)
+    name = _RENAMED.get(argument, argument)
     options = {field.name for field in dataclasses.fields(command) if "Positional" not in str(field.type)}
     values = (value if isinstance(value, tuple) else (value,) for value in vars(command).values())
     # A file or a folder may have the name of an option.

@@ -47,8 +47,6 @@ class Inspect(ResponseOptions):
         from animat.responses.windows import DEFAULT_WINDOW_MS, check_window
         from animat.robots.registry import robot_named
 
-        if self.out is not None:
-            expect_writable(self.out)
         if self.optimum is not None:
             try:
                 robot_named(self.optimum)
@@ -60,6 +58,7 @@ class Inspect(ResponseOptions):
         check_threshold(self.burst_threshold)
         files = list_recordings(self.recordings)
         if self.out is not None:
+            expect_writable(self.out)
             # The figures of the series have a name of their own.
             expect_unique_stems([file.name for file in files], "series")
         inspected: list[dict[str, Any]] = []

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional
 
-from animat.cli.named_numbers import read_sac
-from animat.cli.stimulation import StimulationOptions, expect_no_fault
+from animat.cli.command import StimulationOptions, expect_no_fault, read_sac
 from animat.errors import InvalidArgument
 from animat.writing import exclusive_lock
 

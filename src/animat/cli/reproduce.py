@@ -6,9 +6,8 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from animat.cli.jobs import JobOptions
+from animat.cli.command import JobOptions
 from animat.cli.study import run_and_report
-from animat.errors import InvalidArgument
 
 
 @dataclass(frozen=True)
@@ -29,10 +28,7 @@ class Reproduce(JobOptions):
         from animat.studies.paper import paper_study
         from animat.studies.source import read_seeds
 
-        try:
-            seeds = read_seeds(self.culture_seed)
-        except InvalidArgument as error:
-            raise InvalidArgument(f"--culture-seed: {str(error).removeprefix('seeds: ')}") from error
+        seeds = read_seeds(self.culture_seed)
         if self.study == "context":
             return self._context(seeds)
         study = paper_study(1, self.seed, quick=self.quick)
@@ -43,10 +39,8 @@ class Reproduce(JobOptions):
         return run_and_report(replace(study, culture=culture), Path(), self)
 
     def _context(self, cultures: list[int]) -> dict[str, Any]:
-        """Run the context study."""
-        from animat.studies.context import run_context_study
+        from animat.studies.context import ContextStudy, quick_context_study, run_context_study
         from animat.studies.context_page import summarise_robot, write_context_page
-        from animat.studies.context_tasks import ContextStudy, quick_context_study
 
         study = (quick_context_study if self.quick else ContextStudy)(cultures=tuple(cultures), seed=self.seed)
         with self.executing("study") as execution:

@@ -84,8 +84,6 @@ class SimulatorOptions(ResponseOptions):
         trained = next((policy for policy in policies.values() if policy.mapping is not None), None)
         if trained is not None:
             return self.timeline(recordings, trained)
-        if recordings:
-            raise InvalidArgument(f"--recordings: expected none for policies without neurons, got {recordings[0]}")
         self.expect_no_simulator("for policies without neurons")
         return None
 
@@ -99,7 +97,7 @@ class SimulatorOptions(ResponseOptions):
 
 _OF_SIMULATORS = (
     *("conditions", "window_ms", "burst_threshold", "allow"),
-    *("simulator", "bins", "range_hz", "at_min", "duration_min", "percentiles"),
+    *("simulator", "bins", "range_hz", "recordings", "at_min", "duration_min", "percentiles", "delivery"),
 )
 """Options that choose simulators, or how they are made and used."""
 

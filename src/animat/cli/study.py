@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from tyro.conf import Positional
 
-from animat.cli.jobs import JobOptions
+from animat.cli.command import JobOptions
 
 if TYPE_CHECKING:
     from animat.studies.specification import Study
@@ -40,15 +40,15 @@ def run_and_report(study: Study, base: Path, command: JobOptions) -> dict[str, A
 def _run_one(study: Study, base: Path, command: JobOptions) -> dict[str, Any]:
     from animat.columns import align_columns
     from animat.report.results import Results
-    from animat.studies.heuristic import not_outperforming
-    from animat.studies.places import results_file
+    from animat.studies.folder import RESULTS
+    from animat.studies.outperforming import not_outperforming
     from animat.studies.results import read_typed
     from animat.studies.run import run_study
 
     began = time.monotonic()
     with command.executing("study") as execution:
         ran = run_study(study, command.out, base=base, **execution)
-    results = read_typed(results_file(ran.folder), Results)
+    results = read_typed(ran.folder / RESULTS, Results)
     cells = []
     for row in results.comparisons:
         paper = "" if row.paper_p is None else f"; the paper's p {row.paper_p:.3g}, which implies U {row.paper_u:g}"
@@ -75,8 +75,7 @@ def _run_one(study: Study, base: Path, command: JobOptions) -> dict[str, Any]:
 def _run_many(study: Study, base: Path, command: JobOptions) -> dict[str, Any]:
     from animat.columns import align_columns
     from animat.errors import AnimatError, counted
-    from animat.studies.cultures import run_over_cultures
-    from animat.studies.cultures_page import write_cultures_page
+    from animat.studies.cultures import run_over_cultures, write_cultures_page
     from animat.studies.results import MISSING
 
     began = time.monotonic()

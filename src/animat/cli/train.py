@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional
 
-from animat.cli.jobs import JobOptions
-from animat.cli.named_numbers import read_numbers, read_sac
+from animat.cli.command import JobOptions, read_numbers, read_sac
 from animat.cli.responses import SimulatorOptions, print_warnings
 from animat.errors import InvalidArgument, UnusableData, counted, expect_at_least, in_file, in_min
 from animat.records import as_json
@@ -148,10 +147,6 @@ class Train(SimulatorOptions, JobOptions):
             expect_fit(robot.name, robot.n_commands, count_readouts(readouts))
         elif readouts != ALL:
             raise InvalidArgument(f"--readouts: expected none without neurons, got {self.readouts}")
-        elif self.delivery != "chosen":
-            raise InvalidArgument(f"--delivery: expected none without neurons, got {self.delivery}")
-        elif self.recordings:
-            raise InvalidArgument(f"--recordings: expected none without neurons, got {self.recordings[0]}")
         else:
             self.expect_no_simulator("without neurons")
         lessons = () if self.lessons is None else read_lessons(self.lessons)
@@ -227,11 +222,7 @@ _PAPER: dict[str, Any] = {"mapping": "1-threshold", "policies": 10, "share": 100
 
 
 def _random_return(training: Training, timeline: SimulatorTimeline | None) -> float | None:
-    """The mean return of random actions on the first simulator; None for a robot that is stepped on the host.
-
-    Raises:
-        InvalidArgument: for a return beyond the robot's `return_range`.
-    """
+    """The mean return of random actions on the first simulator; None for a robot that is stepped on the host."""
     from animat.compilation import keep_compilations
     from animat.evaluation.rollouts import Uniform, roll_out
     from animat.robots.host import HostRobot

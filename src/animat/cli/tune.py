@@ -9,7 +9,7 @@ from typing import Any
 
 from tyro.conf import Positional
 
-from animat.cli.jobs import JobOptions
+from animat.cli.command import JobOptions
 from animat.errors import counted
 
 
@@ -24,14 +24,12 @@ class TuneFile(JobOptions):
 
     def run(self) -> dict[str, Any]:
         from animat.columns import align_columns
-        from animat.tuning.search import expect_optuna
         from animat.tuning.specification import read_tuning
 
         tuning = read_tuning(self.specification)
-        expect_optuna()
         from animat.tuning.results import BEST, HISTORY, IMPORTANCE, describe_settings
         from animat.tuning.run import tune
-        from animat.tuning.space import first_settings
+        from animat.tuning.specification import first_settings
 
         self.print_caveats(tuning.study.robots)
         began = time.monotonic()

@@ -44,13 +44,12 @@ class Validate(ResponseOptions):
         from animat.responses.extraction import extract_series
         from animat.responses.readouts import read_readouts
 
-        if self.out is not None:
-            expect_writable(self.out)
         expect_at_least("--seed", self.seed, 0)
         by = None if self.conditions is None else conditions_named(self.conditions)
         readouts = read_readouts(self.readouts)
         files = list_recordings(self.recordings)
         if self.out is not None:
+            expect_writable(self.out)
             expect_unique_stems([file.name for file in files])
         keep_compilations()
         validated = []

@@ -27,6 +27,7 @@ from jaxtyping import Float64, Int64
 
 from animat.errors import InvalidFile, as_invalid_file
 from animat.plain_file import expect_plain_file
+from animat.recordings.formats.nwb_spikes import SpikeBlock
 from animat.writing import sync_folder
 
 MAGIC = b"ANIMATL1"
@@ -133,9 +134,9 @@ class Log:
         """The fields of each record, without the spikes."""
         return (parse_fields(self.path, data) for data in self._data())
 
-    def spike_blocks(self) -> Iterator[tuple[Float64[np.ndarray, " spikes"], Int64[np.ndarray, " spikes"]]]:
+    def spike_blocks(self) -> Iterator[SpikeBlock]:
         """All spikes in the order they were written: times in s and channels, about a million at a time."""
-        block: list[tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]] = []
+        block: list[SpikeBlock] = []
         n_spikes = 0
         for times_s, channels in map(_spikes, self._data()):
             if len(times_s):
@@ -200,7 +201,7 @@ def parse_record(path: Path, data: bytes) -> Record:
     return Record(parse_fields(path, data), *_spikes(data))
 
 
-def _spikes(data: bytes) -> tuple[Float64[np.ndarray, " spikes"], Int64[np.ndarray, " spikes"]]:
+def _spikes(data: bytes) -> SpikeBlock:
     """The times and channels of a record's spikes."""
     _, n_fields, n_spikes, _ = HEAD.unpack_from(data)
     at = HEAD.size + n_fields
@@ -208,9 +209,7 @@ def _spikes(data: bytes) -> tuple[Float64[np.ndarray, " spikes"], Int64[np.ndarr
     return np.frombuffer(data, "<f8", n_spikes, at).astype(np.float64), channels.astype(np.int64)
 
 
-def _joined(
-    block: Sequence[tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]],
-) -> tuple[Float64[np.ndarray, " spikes"], Int64[np.ndarray, " spikes"]]:
+def _joined(block: Sequence[SpikeBlock]) -> SpikeBlock:
     times_s, channels = zip(*block, strict=True)
     return np.concatenate(times_s), np.concatenate(channels)
 

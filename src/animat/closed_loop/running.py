@@ -310,8 +310,8 @@ def _put_sources_first(turns: list[int], agents: Sequence[Agent]) -> list[int]:
     for number, agent in enumerate(agents):
         if agent.delivery != "yoked" or number not in turns:
             continue
-        assert isinstance(agent.controller, Mapping)
-        sources = [i for i, turn in enumerate(turns) if agents[turn].name in agent.controller]
+        names = agent.controller if isinstance(agent.controller, Mapping) else ()
+        sources = [i for i, turn in enumerate(turns) if agents[turn].name in names]
         if not sources:
             raise InvalidArgument(f"agents: expected episodes for {agent.name!r} to repeat, got none")
         if (first := turns.index(number)) < sources[0]:

@@ -68,7 +68,7 @@ def roll_out_on_host(
 def paths_on_host(
     environment: Environment[Any], simulator: Neurons, actors: Any, keys: Key[Array, " actors"], seed: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """One episode of each actor: observations, commands and lengths, as in `animat.studies.paths.Paths`."""
+    """One episode of each actor: observations, commands and lengths, as in `animat.studies.episodes.Paths`."""
     robot, n = environment.robot, len(keys)
     assert isinstance(robot, HostRobot)
     observations = np.zeros((n, robot.episode_limit + 1, len(robot.observation_spec)), np.float32)

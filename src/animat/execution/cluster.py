@@ -12,7 +12,6 @@ import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Executor, Future
 from concurrent.futures import wait as wait_for
-from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar, final
 
@@ -25,7 +24,6 @@ from animat.extras import expect_extra
 
 P = ParamSpec("P")
 T = TypeVar("T")
-
 _CONNECT_S = 60
 
 
@@ -142,15 +140,6 @@ def _why_refused(address: str, worker: dict[str, Any]) -> str:
     tags = [name for name in worker["resources"] if name.startswith(VERSIONS_PREFIX)]
     got = _format_tag(tags[0]) if tags else "one that was started without --preload " + work.__module__
     return f"worker {address}: expected {_format_tag(versions_tag())}, got {got}; it gets no work"
-
-
-def on_cluster(where: str | None, shared_folder: bool) -> AbstractContextManager[Cluster | None]:
-    """A cluster for the duration of a block, or None; raises InvalidArgument for no shared folder without one."""
-    if where is not None:
-        return Cluster(where, has_shared_folder=shared_folder)
-    if not shared_folder:
-        raise InvalidArgument("--no-shared-folder: expected only with --cluster, got no cluster")
-    return nullcontext()
 
 
 def _expect_listener(address: str) -> None:

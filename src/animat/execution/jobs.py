@@ -75,16 +75,9 @@ class Jobs:
     ) -> dict[str, float]:
         """Run the jobs that are not done, and return the CPU seconds of each.
 
-        The first failure ends the run, but on a cluster the other jobs finish first.
-
-        Args:
-            workers: processes, each on its own core; None: one per core. Not with an executor.
-            executor: executor for the tasks, which must see the folder; it stays open. None: processes on this machine.
-            progress: updated with the share done and the running jobs.
-            has_gpu: whether this machine has a GPU for tasks that train policies; if not, they run on cores.
-
-        Raises:
-            AnimatError: if a job failed; its message names the job, or all that failed.
+        The first failure ends the run, but on a cluster the other jobs finish first. The AnimatError names the job, or
+        all that failed. `workers` and `executor` are as in `animat.execution.training.train`; with `has_gpu` tasks that
+        train policies run on this machine's GPU.
         """
         costs_s = {name: job.cost_s for name, job in self._jobs.items()}
         write_whole(self._folder / UNFINISHED / PLANNED, json.dumps(costs_s, indent=1) + "\n")

@@ -126,8 +126,10 @@ def carry_out_together(
     except AnimatError:
         raise
     except Exception as error:
-        memory = out_of_memory(error)
-        raise AnimatError(_unexpected(error) if memory is None else f"{memory}: {memory_of(tasks[0])}") from error
+        place, memory = traceback.extract_tb(error.__traceback__)[-1], out_of_memory(error)
+        where = f"(in {place.name}, {Path(place.filename).name}, line {place.lineno})"
+        reason = f"{first_line(error)} {where}" if memory is None else f"{memory}: {memory_of(tasks[0])}"
+        raise AnimatError(reason) from error
     digests = [{file.relative_to(folder).as_posix(): digest_of(file) for file in sorted(files)} for files in written]
     cpu_s = (time.process_time() - began_s) / len(tasks)
     return [TaskResult(files, cpu_s) for files in digests]
@@ -166,11 +168,6 @@ def memory_of(task: Task) -> str:
     """The settings that determine a task's memory, as the end of a sentence."""
     settings = ", ".join(f"{name} ({value!r})" for name, value in task.grows_with.items())
     return f"it grows with {settings}: reduce these, or use a machine with more memory"
-
-
-def _unexpected(error: Exception) -> str:
-    place = traceback.extract_tb(error.__traceback__)[-1]
-    return f"{first_line(error)} (in {place.name}, {Path(place.filename).name}, line {place.lineno})"
 
 
 def store(folder: Path, contents: Mapping[str, bytes]) -> None:

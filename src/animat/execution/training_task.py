@@ -110,10 +110,7 @@ def _train(
 
 
 def parts_that_fit(groups: Sequence[Group]) -> list[list[int]]:
-    """Divide groups, by their indices, into parts, as even as possible, that fit into the device's memory.
-
-    A part has at least one group, however large.
-    """
+    """Divide groups, by their indices, into even parts that fit into the device's memory, or are a single group."""
     available = _SHARE * device_memory_bytes()
     parts = 1 if math.isinf(available) else math.ceil(bytes_at_once(groups) / available)
     return [part.tolist() for part in np.array_split(np.arange(len(groups)), min(parts, len(groups)))]

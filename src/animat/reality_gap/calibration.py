@@ -10,12 +10,13 @@ import numpy as np
 from jaxtyping import Float64
 
 from animat.arguments import checked_arguments
+from animat.closed_loop.adaptive import AdaptiveThresholds, kept_counts
 from animat.coding.mapping import Thresholds
-from animat.neurons.history_tracker import AdjustedRanks, HistoryTracker
+from animat.neurons.history import Ranked
+from animat.neurons.history_tracker import AdjustedRanks, HistoryState, HistoryTracker
 from animat.neurons.memory import MemorySimulator
 from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import Kind, fit_simulator, fit_timeline, room_for
-from animat.reality_gap.rereading import reread
 from animat.recordings.findings import Finding
 from animat.recordings.recorded_culture import RecordedCulture
 from animat.responses.condition import Condition
@@ -97,12 +98,9 @@ class Calibration:
                 which it was trained.
             at_min: the minute whose newest recording is used instead; None without a policy: the last.
             adaptive: whether the loop's thresholds will adapt, or are fixed. With adaptive thresholds, simulators are
-                made of responses as these read them (`animat.reality_gap.rereading`), except for recordings in blocks
-                and for policies whose mapping is not thresholds.
-            kind, bins, range_hz: of the simulator, see `fit_timeline`.
-
-        Raises:
-            InvalidArgument, Mismatch, UnusableData: as in `fit_timeline`.
+                made of responses as these read them (`reread`), except for recordings in blocks and for policies
+                whose mapping is not thresholds.
+            kind, bins, range_hz: of the simulator, see `fit_timeline`, whose errors are raised.
         """
         timeline = fit_timeline(series, kind=kind, bins=bins, range_hz=range_hz)
         fit: dict[str, Any] = {"kind": timeline.fitted["kind"], "bins": bins, "range_hz": range_hz}
@@ -155,3 +153,38 @@ class Calibration:
 
         bootstraps, own = tuple(map(fixed, self.bootstraps)), np.asarray(percentiles, np.float64)
         return replace(self, percentiles=own, simulator=fixed(self.simulator), bootstraps=bootstraps)
+
+
+def reread(responses: Responses, adjusted: AdjustedRanks) -> Responses:
+    """Replace each response by the recording's quantile of the rank that adaptive thresholds give it at its time.
+
+    Responses rise and fall together, over seconds and minutes. Adaptive thresholds follow this, so it disturbs the
+    controller less. A simulator draws responses from all times, and takes all of this for chance. So the recording is
+    read again, by thresholds that begin with the first responses of each condition and adapt after each trial
+    (`animat.closed_loop.adaptive`). A simulator of these responses takes only the rest for chance.
+
+    The recording is not in blocks, where condition and time would be confounded. Only x changes, of all channels or of
+    readouts.
+    """
+    first = [slice(kept) for kept in kept_counts(adjusted)]
+    first_hz, first_ranks = (
+        tuple(each[of] for each, of in zip(values, first, strict=True))
+        for values in (adjusted.responses_hz, adjusted.ranks)
+    )
+    thresholds = AdaptiveThresholds(replace(adjusted, responses_hz=first_hz, ranks=first_ranks))
+    read_hz, ranks = responses.read_hz, []
+    histories = Ranked(responses).states(adjusted.remembering.memory)
+    trials = zip(responses.condition, read_hz, histories, responses.is_burst, strict=True)
+    for condition, x_hz, history, is_burst in trials:
+        ranks.append(thresholds.ranks(x_hz))
+        if not is_burst:
+            thresholds.add(int(condition), HistoryState(*history), x_hz)
+    of_readouts = zip(np.atleast_2d(adjusted.sorted_hz), np.array(ranks).T, strict=True)
+    reread_hz = np.stack([np.quantile(sorted_hz, rank) for sorted_hz, rank in of_readouts], axis=-1)
+    reread_hz = reread_hz.reshape(read_hz.shape)
+    if responses.readout_hz is not None:
+        return replace(responses, readout_hz=reread_hz)
+    presented, place = responses.presentations
+    all_hz = presented.rate_hz.copy()
+    all_hz[place] = reread_hz
+    return replace(responses, rate_hz=reread_hz, presented=replace(presented, rate_hz=all_hz), place=place)

@@ -76,10 +76,7 @@ def predict(
 ) -> dict[str, Prediction]:
     """The prediction for each policy and control, by its name: on a recording's simulator and its bootstrap simulators.
 
-    Args:
-        policies: side by side, with their `names`.
-        seed: decides every random draw.
-        progress: updated before the policies and each control.
+    The policies are side by side, with their `names`.
     """
     progress = progress or Silent()
     simulators, episodes_each = [calibration.simulator] * ROLL_OUTS + list(calibration.bootstraps), EPISODES

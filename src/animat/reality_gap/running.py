@@ -23,18 +23,11 @@ from animat.cultures.failures import describe_error
 from animat.cultures.virtual import VirtualCulture
 from animat.environment import Animat, Environment
 from animat.errors import InvalidArgument
+from animat.evaluation import transfer
 from animat.evaluation.controls import RANDOM, Control, controls_of, coupling_of, interventions_of
 from animat.evaluation.optimal_returns import too_few
 from animat.evaluation.rollouts import networks_of
 from animat.evaluation.statistics import compare_episodes
-from animat.evaluation.transfer import (
-    expect_conditions,
-    no_memory,
-    old_calibration,
-    other_calibration,
-    other_culture,
-    other_simulator,
-)
 from animat.goals.tally import Outcome
 from animat.progress import Progress, in_phase
 from animat.reality_gap.calibration import Calibration
@@ -228,7 +221,7 @@ def run_policies(
 
 def _warnings(first: Policy, loop: Loop, calibration: Calibration, now_min: float) -> Iterator[Finding]:
     """Known reasons why the measured return may differ from the prediction."""
-    yield from other_calibration(first.presentation, calibration.presentation)
+    yield from transfer.other_calibration(first.presentation, calibration.presentation)
     if first.delivery == "shuffled":
         message = (
             "the policies were trained as a control, with conditions drawn at random whatever they chose; this loop "
@@ -247,10 +240,12 @@ def _warnings(first: Policy, loop: Loop, calibration: Calibration, now_min: floa
             "--thresholds fixed to have them as in training"
         )
         yield Finding("moving-percentiles", "warning", message)
-    yield from other_simulator(first.fitted, calibration.fitted)
-    yield from other_culture(first.culture, calibration.culture)
-    yield from old_calibration(calibration.start_min, now_min)
-    yield from no_memory(calibration.findings, calibration.presentation, has_memory=calibration.simulator.has_memory)
+    yield from transfer.other_simulator(first.fitted, calibration.fitted)
+    yield from transfer.other_culture(first.culture, calibration.culture)
+    yield from transfer.old_calibration(calibration.start_min, now_min)
+    yield from transfer.no_memory(
+        calibration.findings, calibration.presentation, has_memory=calibration.simulator.has_memory
+    )
     if isinstance(loop.robot, HostRobot):
         episodes_predicted = ROLL_OUTS * episodes_on_host(loop.robot)
         message = (
@@ -275,12 +270,9 @@ def _why_no_optimum(loop: Loop, calibration: Calibration) -> str | None:
 
 
 def check_policies(policies: Mapping[str, Policy]) -> Policy:
-    """Raise unless policies can take turns in one closed loop; return the first, which represents all.
+    """The first of policies that can take turns in one closed loop, which represents all.
 
-    Raises:
-        InvalidArgument: for no policies.
-        Mismatch: if they differ in robot, mapping, readouts, conditions, presentation, response window, percentiles,
-            delivery, cost of pulses, or how their training simulators were fitted.
+    Raises InvalidArgument for no policies, and Mismatch if they differ in more than in their networks.
     """
     alike = ("robot", "mapping", "readouts", "conditions", "commands", "presentation", "window_ms", "fitted")
     return first_of_alike(policies, (*alike, "percentiles", "delivery", "pulse_cost"), "run it alone")
@@ -289,7 +281,7 @@ def check_policies(policies: Mapping[str, Policy]) -> Policy:
 def check_conditions(first: Policy, calibration: Calibration) -> None:
     """Raise Mismatch unless a calibration has the policies' conditions and readouts."""
     if first.mapping is not None:
-        expect_conditions(first, calibration.conditions, calibration.readouts)
+        transfer.expect_conditions(first, calibration.conditions, calibration.readouts)
 
 
 def _rows(

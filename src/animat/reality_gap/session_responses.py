@@ -22,12 +22,7 @@ _TICK += [(name, np.float64) for name in ("read_s", "late_s", "first_s")] + [("e
 
 
 class CommandSums(NamedTuple):
-    """The commands that each condition led to.
-
-    Attributes:
-        presented: how often each condition was presented.
-        total: the sum of its commands, each of them separately.
-    """
+    """How often each condition was presented, and the sum of the commands that it led to, each of them separately."""
 
     presented: Int64[np.ndarray, "*any conditions"]
     total: Float64[np.ndarray, "*any conditions commands"]
@@ -50,7 +45,6 @@ class SessionResponses:
     Attributes:
         responses: in order of time, on the session's clock, with everything that was presented between them.
         episode: index in `returns` of each response's episode.
-        late_s: lateness of its pulses.
         moved: whether it moved the robot, and was not repeated or skipped as a burst.
         command: with which it moved the robot; NaN if it did not.
         returns: of the episodes, in order of time.

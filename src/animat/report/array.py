@@ -8,8 +8,9 @@ import numpy as np
 from jaxtyping import Float64
 
 from animat.errors import counted
+from animat.lazy import Axes, Figure
 from animat.recordings.recording import Recording
-from animat.report.style import GREY, RED, Axes, Figure, add_legend, new_figure, style_axes
+from animat.report.style import GREY, RED, add_legend, new_figure, style_axes
 from animat.stimulation.selection import Selection
 from animat.tables import UNKNOWN
 

@@ -3,30 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from textwrap import wrap
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
 
+from animat.lazy import Axes, Figure
 from animat.report.html import cell, with_minus
 from animat.report.results import ComparedReturns
-from animat.report.style import (
-    BLACK,
-    BLUE,
-    GREY,
-    OPTIMUM,
-    ORANGE,
-    Axes,
-    Figure,
-    add_common_legend,
-    new_figure,
-    style_axes,
-    title_figure,
-)
+from animat.report.style import BLACK, BLUE, GREY, OPTIMUM, ORANGE, add_common_legend, new_figure, style_axes, wrapped
 
-_NAME_WIDTH = 14
-"""Characters per line of an arm's name, as two stand side by side under a panel."""
+_NAME_WIDE_IN = 1.2
+"""Width of an arm's name, as two stand side by side under a panel."""
 
 
 class Pair(NamedTuple):
@@ -49,8 +37,7 @@ def draw_comparisons(pairs: Sequence[Pair], title: str) -> Figure:
     Boxes reach from the first to the third quartile with the median, whiskers to 1.5 times that range; points are
     policies. `pairs` has at least one comparison, all on one robot.
     """
-    figure = new_figure(max(2.7 * len(pairs), 4.5), 6.4)
-    title_figure(figure, title)
+    figure = new_figure(max(2.7 * len(pairs), 4.5), 6.4, title)
     rows = figure.subplots(2, len(pairs), squeeze=False, height_ratios=[1.0, 0.9])
     for whole, close, pair in zip(*rows, pairs, strict=True):
         row = pair.row
@@ -79,7 +66,7 @@ def draw_comparisons(pairs: Sequence[Pair], title: str) -> Figure:
 def _name(arm: str, score: float | None) -> str:
     """The arm on two lines or more, and its score on the last."""
     first, _, rest = arm.partition(" ")
-    lines = [each for part in (first, rest) for each in wrap(part, _NAME_WIDTH) or [""]]
+    lines = [wrapped(part, _NAME_WIDE_IN) for part in (first, rest)]
     # Adding 0 turns -0 into 0.
     scored = "" if score is None else f"\nscore {round(score, 2) + 0.0:.2f}"
     return with_minus("\n".join(lines) + scored)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from animat.lazy import Axes, Figure
 from animat.report.results import CONTEXT_GAP_LEVEL, ContextRow
-from animat.report.style import BLACK, BLUE, GREY, ORANGE, Axes, Figure, add_common_legend, new_figure, style_axes
+from animat.report.style import BLACK, BLUE, GREY, ORANGE, add_common_legend, new_figure, style_axes
 
 _SPACING = 0.11
 """Distance between two cultures on a row, in rows."""

@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from textwrap import fill
 
+from animat.lazy import Figure
 from animat.report.html import with_minus
 from animat.report.results import TRAINED, ControlReturns
-from animat.report.style import BLUE, GREY, OPTIMUM, ORANGE, Figure, add_common_legend, grid_of_panels, style_axes
+from animat.report.style import BLUE, GREY, OPTIMUM, ORANGE, add_common_legend, grid_of_panels, style_axes, wrapped
 
-_TITLE_WIDTH = 36
-"""Characters per line of a panel's title."""
+_TITLE_WIDE_IN = 3.0
+"""Width of a panel's title, which begins right of the names of the rows."""
 
 
 def draw_controls(panels_of: Sequence[tuple[str, Sequence[ControlReturns]]], title: str) -> Figure:
-    """One panel per mapping and recording: mean returns with standard errors, random actions and the optimum.
-
-    Each panel has a title, and the trained policies followed by the controls.
-    """
+    """A titled panel per mapping and recording: returns of trained policies and controls, random ones, the optimum."""
     most = max(len(rows) for _, rows in panels_of)
     figure, panels = grid_of_panels(len(panels_of), 2, 4.6, 0.9 + 0.24 * most, title)
     for axes, (through, rows) in zip(panels, panels_of, strict=True):
@@ -32,7 +29,7 @@ def draw_controls(panels_of: Sequence[tuple[str, Sequence[ControlReturns]]], tit
             axes.axvline(optimum, color=OPTIMUM, linewidth=1.2, linestyle="--", label="optimal return")
         if rows[0].random is not None:
             axes.axvline(rows[0].random, color=GREY, linewidth=1.2, linestyle=":", label="random actions")
-        style_axes(axes, fill(through, _TITLE_WIDTH), "mean return and its standard error", "")
+        style_axes(axes, wrapped(through, _TITLE_WIDE_IN), "mean return and its standard error", "")
         axes.locator_params(axis="x", nbins=5)
         axes.grid(axis="y", linewidth=0.4, alpha=0.5)
     add_common_legend(figure, panels, columns=4)

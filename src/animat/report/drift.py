@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-from animat.report.style import BLACK, BURST, GREY, Figure, add_legend, condition_colours, new_figure, style_axes
+from animat.lazy import Figure
+from animat.report.style import BLACK, GREY, RED, add_legend, condition_colours, new_figure, style_axes
 from animat.responses.responses import Responses
 
 PERCENTILES = (10, 25, 50, 75, 90)
 """Percentiles of the responses that are drawn."""
-
 _MOST_CONDITIONS = 12
 
 
@@ -47,10 +47,7 @@ def drift_of(series: Sequence[Responses]) -> Drift:
 
 
 def draw_drift(series: Sequence[Responses]) -> Figure:
-    """Pooled percentiles, P(x >= P50) of at most 12 conditions, and the share of bursts, all over time.
-
-    `series` is as for `drift_of`.
-    """
+    """`drift_of` a series: pooled percentiles, P(x >= P50) of at most 12 conditions, and the share of bursts."""
     drift = drift_of(series)
     minutes, percentiles = drift.minutes, drift.percentiles_hz
     figure = new_figure(7.0, 7.5)
@@ -76,7 +73,7 @@ def draw_drift(series: Sequence[Responses]) -> Figure:
     style_axes(middle, title, "", "P(x ≥ P50)")
     add_legend(middle, loc="upper left", bbox_to_anchor=(1.0, 1.0))
 
-    lower.plot(minutes, drift.bursts, color=BURST, marker="o", markersize=3, clip_on=False)
+    lower.plot(minutes, drift.bursts, color=RED, marker="o", markersize=3, clip_on=False)
     lower.set_ylim(0, max(0.1, 1.1 * float(np.nan_to_num(drift.bursts).max())))
     style_axes(lower, "responses that are bursts", "start of the recording (min)", "share")
     return figure

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from animat.report.style import Figure, grid_of_panels, new_figure, style_axes, title_figure, wrapped
+from animat.lazy import Figure
+from animat.report.style import grid_of_panels, new_figure, style_axes, wrapped
 from animat.robots.base import Robot, capability
 from animat.robots.drawing import draw_robot
 
@@ -19,10 +20,7 @@ _WIDE_IN = 3.1
 
 
 def draw_paths(robot: Robot[Any], paths: Mapping[str, Sequence[Path]], title: str) -> Figure:
-    """One panel per arm with one episode of each policy, drawn by the robot's method `draw_paths`.
-
-    Observations are in the robot's units.
-    """
+    """One panel per arm with one episode of each policy, in the robot's units, drawn by its method `draw_paths`."""
     draw = capability(robot, "draw_paths")
     figure, panels = grid_of_panels(len(paths), 3, _WIDE_IN, 2.5, title)
     for axes, (name, episodes) in zip(panels, paths.items(), strict=True):
@@ -38,8 +36,7 @@ def draw_frames(robot: Robot[Any], episodes: Mapping[str, tuple[Path, Sequence[f
     """
     first = draw_robot(robot, next(iter(episodes.values()))[0][0])
     wide = first.shape[1] / first.shape[0]
-    figure = new_figure(9.5, 0.6 + len(episodes) * (9.5 / _FRAMES / wide + 0.28))
-    title_figure(figure, title)
+    figure = new_figure(9.5, 0.6 + len(episodes) * (9.5 / _FRAMES / wide + 0.28), title)
     rows = figure.subplots(len(episodes), _FRAMES, squeeze=False)
     for axes_row, (name, (path, commands)) in zip(rows, episodes.items(), strict=True):
         for axes, i in zip(axes_row, np.linspace(0, len(path) - 1, _FRAMES).round().astype(int), strict=True):

@@ -1,26 +1,18 @@
-"""The study in one figure: how each arm does on each robot, between random actions and the optimal return."""
+"""A study in one figure, a panel for each robot: how each arm does, or each comparison over many cultures."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from textwrap import fill
 
 import numpy as np
 from jaxtyping import Float64
 
-from animat.report.results import Score
-from animat.report.style import (
-    BLUE,
-    GREY,
-    NAME_WIDTH,
-    OPTIMUM,
-    SKY,
-    Figure,
-    add_common_legend,
-    new_figure,
-    style_axes,
-    wrapped,
-)
+from animat.lazy import Figure
+from animat.report.results import OverCultures, Score
+from animat.report.style import BLACK, BLUE, GREY, OPTIMUM, SKY, add_common_legend, new_figure, style_axes, wrapped
+
+_NAME_WIDE_IN = 2.3
+"""Width of a name beside a panel, of which there are two in a row."""
 
 
 def draw_headline(rows: Sequence[tuple[Score, Float64[np.ndarray, " policies"]]], *, narrow: bool = False) -> Figure:
@@ -29,15 +21,14 @@ def draw_headline(rows: Sequence[tuple[Score, Float64[np.ndarray, " policies"]]]
     The axis covers all returns; an interval that extends beyond it ends in an arrow. A narrow figure is as wide as a
     phone, with the panels below each other. Each score comes with the mean return of each policy.
     """
-    robots = list(dict.fromkeys(row.robot for row, _ in rows))
-    most = max(sum(row.robot == robot for row, _ in rows) for robot in robots)
-    names = {row.arm: fill(row.arm, NAME_WIDTH) for row, _ in rows}
+    robots = dict.fromkeys(row.robot for row, _ in rows)
+    by_robot = {robot: [each for each in rows if each[0].robot == robot] for robot in robots}
+    names = {row.arm: wrapped(row.arm, _NAME_WIDE_IN) for row, _ in rows}
     lines = max(name.count("\n") + 1 for name in names.values())
-    height_in, n = 1.2 + max(0.34, 0.18 * lines) * most, len(robots)
+    height_in, n = 1.2 + max(0.34, 0.18 * lines) * max(map(len, by_robot.values())), len(by_robot)
     figure = new_figure(3.6, height_in * n) if narrow else new_figure(4.6 * n, height_in)
     panels = list(figure.subplots(*((n, 1) if narrow else (1, n)), squeeze=False).flat)
-    for axes, robot in zip(panels, robots, strict=True):
-        own = [each for each in rows if each[0].robot == robot]
+    for axes, (robot, own) in zip(panels, by_robot.items(), strict=True):
         style_axes(axes, wrapped(robot, 2.0), "mean return of an episode", "")
         every = [(row.interquartile_mean, row.random, row.optimum, *policies.tolist()) for row, policies in own]
         known = [value for of_arm in every for value in of_arm if value is not None]
@@ -63,4 +54,29 @@ def draw_headline(rows: Sequence[tuple[Score, Float64[np.ndarray, " policies"]]]
         axes.set_ylim(len(own) - 0.5, -0.5)
         axes.grid(axis="x", linewidth=0.4, alpha=0.5)
     add_common_legend(figure, panels, columns=2 if narrow else 3 if n == 1 else 5)
+    return figure
+
+
+def draw_over_cultures(rows: Sequence[tuple[OverCultures, Sequence[float]]]) -> Figure:
+    """One panel per robot, one row per comparison: a point for each culture, and their mean with its interval.
+
+    Each comparison comes with its difference on every culture, second arm minus first.
+    """
+    robots = dict.fromkeys(row.robot for row, _ in rows)
+    by_robot = {robot: [each for each in rows if each[0].robot == robot] for robot in robots}
+    figure = new_figure(4.4 * len(by_robot), 1.5 + 0.5 * max(map(len, by_robot.values())))
+    panels = figure.subplots(1, len(by_robot), squeeze=False)[0]
+    for axes, (robot, own) in zip(panels, by_robot.items(), strict=True):
+        style_axes(axes, wrapped(robot, 2.0), "difference of the mean returns,\nsecond arm minus first", "")
+        axes.axvline(0, color=GREY, linewidth=0.8)
+        for place, (row, differences) in enumerate(own):
+            places = [place + 0.16] * len(differences)
+            axes.plot(differences, places, "o", color=BLUE, alpha=0.6, markersize=4, label="a culture")
+            low, high = row.low_95, row.high_95
+            if low is not None and high is not None:
+                axes.plot([low, high], [place - 0.12] * 2, color=BLACK, linewidth=1.6, label="95 % interval")
+            axes.plot(row.difference, place - 0.12, "D", color=BLACK, markersize=5, label="mean over cultures")
+        axes.set_yticks(range(len(own)), [wrapped(row.comparison, _NAME_WIDE_IN) for row, _ in own])
+        axes.set_ylim(len(own) - 0.5, -0.5)
+    add_common_legend(figure, panels, columns=3)
     return figure

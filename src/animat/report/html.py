@@ -15,7 +15,7 @@ from urllib.parse import quote
 from PIL import Image
 
 from animat.errors import as_invalid_file
-from animat.report.style import PNG_DPI
+from animat.report.style import FORMATS, PNG_DPI
 from animat.writing import write_whole
 
 MINUS = "\u2212"
@@ -40,13 +40,8 @@ def with_links(text: str, files: Sequence[str] = ()) -> str:
     parts = re.split(f"({names})", text) if names else [text]
     link = Markup('<a href="{}">{}</a>')
     # Every second part is a name.
-    linked = (link.format(url_of(part), part) if i % 2 else escape(with_minus(part)) for i, part in enumerate(parts))
+    linked = (link.format(quote(part), part) if i % 2 else escape(with_minus(part)) for i, part in enumerate(parts))
     return Markup("").join(linked)
-
-
-def url_of(file: str) -> str:
-    """The link to a file relative to the page: names can contain `#` or `:`, which mean something else in a link."""
-    return quote(file)
 
 
 @dataclass(frozen=True)
@@ -71,6 +66,12 @@ class Picture:
         """Width on the page: 100 pixels per inch, so that text in figures is as large as text around them."""
         with as_invalid_file(self.file, ending=_DRAW_AGAIN), Image.open(self.file) as png:
             return png.width * 100 // PNG_DPI
+
+
+def picture_of(folder: Path, name: str, title: str, caption: str, *numbers: str, narrow: Path | None = None) -> Picture:
+    """A figure of `save_formats` on the page in this folder, with links to its formats and the files of its numbers."""
+    beside = (*(f"{name}.{ending}" for ending in FORMATS[1:]), *numbers)
+    return Picture(folder / f"{name}.{FORMATS[0]}", title, caption, beside, narrow)
 
 
 @dataclass(frozen=True)
@@ -102,8 +103,8 @@ Columns: TypeAlias = list[tuple[str, "str | Callable[[Any], Any]"]]
 
 
 def columns_of(*fields: str) -> Columns:
-    """Columns named after their fields, with spaces."""
-    return [(name.replace("_", " "), name) for name in fields]
+    """Columns named after their fields, with spaces, and minutes in parentheses."""
+    return [(re.sub("_min$", " (min)", name).replace("_", " "), name) for name in fields]
 
 
 def table_of(title: str, records: Sequence[Any], columns: Columns, **more: Any) -> Table:
@@ -144,10 +145,8 @@ def write_page(
 ) -> Path:
     """Write the page atomically; each section has an entry in the table of contents.
 
-    The lead follows the title; the colophon is lines at the end, with versions and seeds.
-
-    Raises:
-        InvalidFile: if the page cannot be written, or a figure cannot be read.
+    The lead follows the title; the colophon is lines at the end, with versions and seeds. Raises InvalidFile if the
+    page cannot be written, or a figure cannot be read.
     """
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
@@ -158,7 +157,8 @@ def write_page(
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"cell": cell, "prose": with_links, "data_url": _data_url, "url": url_of}
+    # Names of files can contain `#` or `:`, which mean something else in a link.
+    environment.filters |= {"cell": cell, "prose": with_links, "data_url": _data_url, "url": quote}
     page = environment.get_template("report.html.j2")
     filled = page.render(title=title, lead=lead, sections=sections, anchors=anchors_of(sections), colophon=colophon)
     return write_whole(Path(path), filled)

@@ -8,17 +8,15 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from animat.errors import InvalidArgument, Mismatch, counted
+from animat.lazy import Figure
 from animat.recordings.findings import Finding
 from animat.recordings.recording import Recording
 from animat.recordings.response_table import ResponseTable
 from animat.report.array import draw_array
-from animat.report.burst_separation import draw_burst_separation
 from animat.report.drift import draw_drift
-from animat.report.psth import draw_psth
-from animat.report.raster import draw_raster, draw_spontaneous
-from animat.report.response_histograms import draw_response_histograms
-from animat.report.responses_over_time import draw_responses_over_time
-from animat.report.style import Figure, save_figure
+from animat.report.response_histograms import draw_burst_separation, draw_response_histograms, draw_responses_over_time
+from animat.report.spikes import draw_psth, draw_raster, draw_spontaneous
+from animat.report.style import save_figure
 from animat.responses.bursts import BIN_S, NetworkBursts
 from animat.responses.inspection import Inspection
 from animat.responses.psth import PostStimulusHistogram, post_stimulus_histogram
@@ -113,11 +111,8 @@ def draw_series(
     """Draw a series: `series-array`, `series-over-time`, `series-drift`; `file_format` is one of `FORMATS`.
 
     The array is drawn if the positions of the first recording are known, the other figures if there are two recordings
-    or more. `series` may be in any order.
-
-    Raises:
-        InvalidArgument: for no responses.
-        Mismatch: for recordings with different conditions.
+    or more. `series` may be in any order. Raises InvalidArgument for no responses, and Mismatch for recordings with
+    different conditions.
     """
     if not series:
         raise InvalidArgument("series: expected the responses of at least one recording, got none")

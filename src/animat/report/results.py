@@ -133,9 +133,7 @@ class HeuristicComparison:
 class ReflexComparison:
     """Trained policies and the best coupling, as in `animat.evaluation.coupling`; None for unknown values.
 
-    Attributes:
-        gap, score: the context gap of the task and the context score of the policies, with their 95 % intervals.
-        needs_context: whether the task significantly needs more than a reflex.
+    Gap and score are the context gap of the task and the context score of the policies, with their 95 % intervals.
     """
 
     robot: str
@@ -155,12 +153,7 @@ class ReflexComparison:
 
 @dataclass(frozen=True)
 class ObjectiveMet:
-    """How far an arm's policies or a control met an objective of a robot's goal, and the whole goal.
-
-    Attributes:
-        success_share, margin: of the goal, the same for all of its objectives.
-        satisfaction: of the objective, %.
-    """
+    """How far an arm's policies or a control met an objective of a robot (`satisfaction`, %), and its whole goal."""
 
     robot: str
     arm: str
@@ -195,8 +188,7 @@ class OverCultures:
         mean_first, mean_second: mean returns of the arms, each culture counting the same.
         difference: mean of the cultures' differences, second minus first.
         low_95, high_95: its percentile bootstrap interval over cultures, too narrow with few; None with fewer than two.
-        larger_in: number of cultures in which the second arm's mean return is larger.
-        holds_in: number of cultures in which the second arm was found to be better.
+        larger_in, holds_in: numbers of cultures in which the second arm's mean return is larger, and significantly so.
         tested: number of cultures with enough policies to find a difference.
     """
 

@@ -12,21 +12,18 @@ from typing import Any
 import numpy as np
 
 from animat.errors import InvalidArgument
-from animat.lazy import Axes as Axes
-from animat.lazy import Figure as Figure
+from animat.lazy import Axes, Figure
 from animat.writing import atomic_write
 
 FORMATS = ("png", "svg", "pdf")
-
 PNG_DPI = 160
-
 # Okabe and Ito's palette, which people with any common colour blindness can tell apart.
 BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
 BLUE, RED, PURPLE, GREY = "#0072B2", "#D55E00", "#CC79A7", "#8C8C8C"
 PALETTE = (BLUE, ORANGE, GREEN, PURPLE, SKY, RED)
 """In the order of use."""
 WINDOW, OPTIMUM = ORANGE, BLACK
-NON_BURST, BURST, MEDIAN = BLUE, RED, RED
+MEDIAN = RED
 
 # Text stays text in an SVG. Without the salt, element names are random, and the same figure gives different files.
 _SAVING: dict[Any, Any] = {"svg.fonttype": "none", "svg.hashsalt": "animat"}
@@ -34,17 +31,18 @@ _SAVING_LOCK = threading.Lock()
 """matplotlib's settings are those of all threads, such as the workers of an executor."""
 
 
-NAME_WIDTH = 28
-"""Characters per line of a name beside a panel, of which there are two in a row."""
+def new_figure(width_in: float, height_in: float, title: str = "") -> Figure:
+    """An empty figure of a size in inches; it needs no display and changes no global state.
 
-
-def new_figure(width_in: float, height_in: float) -> Figure:
-    """An empty figure of a size in inches; it needs no display and changes no global state."""
+    The title is on as many lines as it needs; dollar signs in it, as in names of files, stay.
+    """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(width_in, height_in), layout="constrained")
     FigureCanvasAgg(figure)
+    if title:
+        figure.suptitle(wrapped(title, width_in), fontsize=10, parse_math=False)
     return figure
 
 
@@ -60,11 +58,6 @@ def style_axes(axes: Axes, title: str, x_label: str, y_label: str) -> None:
 def wrapped(title: str, width_in: float) -> str:
     """A title of a panel of this width, on as many lines as it needs; sets of electrodes break between electrodes."""
     return fill(title.replace("+", "+ "), max(8, int(width_in / 0.082))).replace("+ ", "+")
-
-
-def title_figure(figure: Figure, title: str) -> None:
-    """Set the title of a figure, on as many lines as it needs; dollar signs in it, as in names of files, stay."""
-    figure.suptitle(wrapped(title, figure.get_figwidth()), fontsize=10, parse_math=False)
 
 
 def add_legend(axes: Axes, **place: Any) -> None:
@@ -106,9 +99,7 @@ def condition_colours(units: Sequence[str]) -> list[str]:
 def save_figure(figure: Figure, path: str | os.PathLike[str]) -> Path:
     """Write a figure atomically as PNG, SVG or PDF, by the path's suffix.
 
-    Raises:
-        InvalidArgument: for another suffix.
-        InvalidFile: if the file cannot be written.
+    Raises InvalidArgument for another suffix, and InvalidFile if the file cannot be written.
     """
     import matplotlib
 
@@ -123,14 +114,18 @@ def save_figure(figure: Figure, path: str | os.PathLike[str]) -> Path:
     return path
 
 
+def save_formats(figure: Figure, folder: Path, name: str) -> list[Path]:
+    """Write a figure in every format, the PNG first; returns the files."""
+    return [save_figure(figure, folder / f"{name}.{ending}") for ending in FORMATS]
+
+
 def grid_of_panels(
     n: int, columns: int, width_in: float, height_in: float, title: str, *, share_x: bool = False, share_y: bool = False
 ) -> tuple[Figure, list[Axes]]:
     """A figure with n panels in rows, each of a size in inches, and the panels."""
     columns = min(columns, max(n, 1))
     rows = max(1, -(-n // columns))
-    figure = new_figure(max(width_in * columns, 4.5), height_in * rows + 0.35)
-    title_figure(figure, title)
+    figure = new_figure(max(width_in * columns, 4.5), height_in * rows + 0.35, title)
     panels = figure.subplots(rows, columns, squeeze=False, sharex=share_x, sharey=share_y).reshape(-1)
     for axes in panels[n:]:
         axes.set_visible(False)

@@ -5,19 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from itertools import accumulate
 
-from animat.report.style import (
-    BLACK,
-    BLUE,
-    GREY,
-    ORANGE,
-    PURPLE,
-    RED,
-    SKY,
-    Figure,
-    add_common_legend,
-    new_figure,
-    style_axes,
-)
+from animat.lazy import Figure
+from animat.report.style import BLACK, BLUE, GREY, ORANGE, PURPLE, RED, SKY, add_common_legend, new_figure, style_axes
 
 _MARKERS = "ov^sDP"
 

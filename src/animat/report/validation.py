@@ -8,20 +8,10 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float64
 
+from animat.lazy import Figure
 from animat.neurons.prediction import LAGS
 from animat.neurons.validation import FREE_RUNS, MARGINAL, PIT_BINS, Band, Validation, pit_shares
-from animat.report.style import (
-    BLACK,
-    BLUE,
-    GREEN,
-    GREY,
-    ORANGE,
-    Figure,
-    add_common_legend,
-    new_figure,
-    style_axes,
-    title_figure,
-)
+from animat.report.style import BLACK, BLUE, GREEN, GREY, ORANGE, add_common_legend, new_figure, style_axes
 
 _COLOURS = {MARGINAL: GREY, "histogram": ORANGE, "empirical": GREEN, "memory": BLUE}
 _HEADER = f"  {'simulator':<11}{'bits/trial':>11}{'CRPS (Hz)':>11}{'off by (p)':>14}{'lag 1':>8}{'run length':>25}"
@@ -69,9 +59,8 @@ def correlations_text(names: Sequence[str], correlations: Float64[np.ndarray, "2
 def draw_validation(name: str, validation: Validation) -> Figure:
     """Three panels: histograms of the transforms, the autocorrelation, and the lengths of runs above P50."""
     v = validation
-    figure = new_figure(10.5, 3.7)
     shaded = f"shaded: 95 % of chance, and of {FREE_RUNS} free runs of the simulators"
-    title_figure(figure, f"{name}: {sum(v.n_held):,} held-out responses; {shaded}")
+    figure = new_figure(10.5, 3.7, f"{name}: {sum(v.n_held):,} held-out responses; {shaded}")
     calibration, correlation, runs = figure.subplots(1, 3)
     # The empirical kind would coincide with the histogram.
     shown = [v.of(kind) for kind in dict.fromkeys(("histogram", v.kind, "memory"))]

@@ -34,7 +34,7 @@ def check_places(given: Any) -> Places:
     """Places with lists as tuples; raises InvalidArgument for anything but a name or a list of distinct groups."""
     if isinstance(given, str) and given in NAMED:
         return given
-    groups = [place for place in given if place != NONE] if isinstance(given, list | tuple) else None
+    groups = [p for p in given if not (isinstance(p, str) and p == NONE)] if isinstance(given, list | tuple) else None
     is_listed = groups is not None and all(isinstance(place, list | tuple) and place for place in groups)
     if not is_listed or not all(type(e) is int and 0 <= e < 2**63 for place in groups or () for e in place):
         raise InvalidArgument(

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from animat.studies.places import RESPONSES
+from animat.studies.folder import RESPONSES
 
 
 class Caption(NamedTuple):

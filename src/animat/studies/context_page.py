@@ -9,12 +9,11 @@ import numpy as np
 
 from animat.errors import counted
 from animat.report.context import draw_context, draw_whose_work
-from animat.report.html import Columns, Section, Table, cell, columns_of, table_of, write_page
+from animat.report.html import Columns, Section, Table, cell, columns_of, picture_of, table_of, write_page
 from animat.report.results import ContextRow, LostRow
-from animat.studies.context import TABLE, WHOSE_WORK, ContextRun
-from animat.studies.context_tasks import ContextStudy
-from animat.studies.figures import picture_of, save_formats
-from animat.studies.places import REPORT
+from animat.report.style import save_formats
+from animat.studies.context import TABLE, WHOSE_WORK, ContextRun, ContextStudy
+from animat.studies.folder import REPORT
 
 
 def write_context_page(study: ContextStudy, found: ContextRun) -> Path:

@@ -1,4 +1,4 @@
-"""A study over many cultures: the same study of each in its own folder, and results over all of them."""
+"""A study over many cultures: the same study of each in its own folder, results over all of them, and their page."""
 
 from __future__ import annotations
 
@@ -15,20 +15,24 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from animat.errors import AnimatError
+from animat.errors import AnimatError, counted
 from animat.execution.cluster import Cluster
 from animat.execution.gpu import find_gpu
 from animat.execution.jobs import expect_workers
 from animat.execution.pinned import PinnedProcesses, own_cores
 from animat.folders import expect_no_other
 from animat.progress import Progress, Silent
+from animat.report.headline import draw_over_cultures
+from animat.report.html import Section, cell, columns_of, picture_of, table_of, write_page
 from animat.report.results import ComparedReturns, OverCultures, Results, Score
-from animat.studies.places import results_file
+from animat.report.style import save_formats
+from animat.studies.arms import arm_differences, arms_table, summarise_arms
+from animat.studies.folder import REPORT, RESULTS
 from animat.studies.results import read_typed, write_named_records, write_parquet, write_records
 from animat.studies.run import StudyRun, run_study
 from animat.studies.source import read_seeds
-from animat.studies.specification import Study
-from animat.studies.tabulating import SECOND, TOO_FEW
+from animat.studies.specification import Compared, Study
+from animat.studies.tabulating import LEVEL, SECOND, TOO_FEW
 from animat.writing import exclusive_lock, write_whole
 
 RESAMPLES = 10_000
@@ -44,11 +48,8 @@ class CulturesRun:
     """Results of a run over cultures.
 
     Attributes:
-        folder: contains a folder for each culture.
-        finished: the finished cultures, by the name of their folder.
-        failed: the errors of the others.
-        comparisons: of each finished culture, by name.
-        summary: each comparison over all finished cultures.
+        finished, failed: the finished cultures, and the errors of the others, by the names of their folders.
+        comparisons, summary: of each finished culture, and over all of them.
         parquet: the scores as a Parquet table; None if fastparquet is missing.
     """
 
@@ -85,15 +86,8 @@ def run_over_cultures(
     fails, the others continue, and the failure is reported at the end. More cultures may be added later; finished jobs
     are not run again.
 
-    Args:
-        study: with `seeds` or `folders` in its culture.
-        folder: for all files; created if it is missing.
-        base, workers, executor, progress: as for `run_study`.
-
-    Raises:
-        AnimatError: if the study of every culture failed, with the error of each.
-        Mismatch: if the folder holds other work, or is in use by another run.
-        InvalidArgument: for fewer than one worker, or workers together with an executor.
+    Arguments and errors are those of `run_study`, for a study with `seeds` or `folders` in its culture; AnimatError is
+    raised if the study of every culture failed, with the error of each.
     """
     expect_workers(workers, executor)
     folder = Path(folder).absolute()
@@ -118,10 +112,9 @@ def _write_manifest(folder: Path, names: Iterable[str], failed: Mapping[str, str
 
 
 def _write_tables(folder: Path, finished: dict[str, StudyRun], failed: dict[str, str]) -> CulturesRun:
-    """Write the tables over the finished cultures."""
     if not finished:
         raise AnimatError("; ".join(f"{name}: {error}" for name, error in failed.items()))
-    results = {name: read_typed(results_file(each.folder), Results) for name, each in finished.items()}
+    results = {name: read_typed(each.folder / RESULTS, Results) for name, each in finished.items()}
     comparisons = {name: each.comparisons for name, each in results.items()}
     summary = over_cultures(list(comparisons.values()))
     scores = {name: each.scores for name, each in results.items()}
@@ -225,3 +218,67 @@ def bootstrap_interval(values: Float64[np.ndarray, " cultures"]) -> tuple[float,
     drawn = np.random.default_rng(0).integers(len(values), size=(RESAMPLES, len(values)))
     low, high = np.quantile(values[drawn].mean(axis=1), (0.025, 0.975))
     return float(low), float(high)
+
+
+def write_cultures_page(study: Study, found: CulturesRun) -> Path:
+    """Write the page and its figure."""
+    sections = []
+    if found.summary:
+        # Every culture has the same comparisons in the same order.
+        of_each = zip(*found.comparisons.values(), strict=True)
+        differences = ([row.mean_second - row.mean_first for row in rows] for rows in of_each)
+        figure = draw_over_cultures([*zip(found.summary, differences, strict=True)])
+        save_formats(figure, found.folder, "over-cultures")
+        sections.append(_summary(study, found))
+    pages = {name: f"{name}/{REPORT}" for name in found.finished}
+    points = [(name, f"finished: {page}") for name, page in pages.items()]
+    points += [(name, f"failed: {why}") for name, why in found.failed.items()]
+    sections.append(Section("Each culture", points=tuple(points), links=tuple(pages.values())))
+    cultures = counted(len(found.finished), "culture") + (f", {len(found.failed)} more failed" if found.failed else "")
+    lead = f"{cultures}. {summarise_arms(study)} on every culture."
+    return write_page(found.folder / REPORT, f"{study.title}: many cultures", lead, sections, [f"Seed {study.seed}."])
+
+
+def _summary(study: Study, found: CulturesRun) -> Section:
+    points, explained = [], set[str]()
+    for row in found.summary:
+        compared = next(each for each in study.comparisons if each.name == row.comparison)
+        differences = list(arm_differences(study.arm(compared.first), study.arm(compared.second)))
+        # Each difference is explained only once.
+        text = " ".join([_describe(compared, row), *(each for each in differences if each not in explained)])
+        points.append((f"{row.robot}, {row.comparison}", text))
+        explained |= set(differences)
+    table = table_of(
+        "Over cultures",
+        found.summary,
+        [
+            *columns_of("comparison", "robot", "mean_first", "mean_second", "difference"),
+            ("95 % interval", lambda row: "–" if row.low_95 is None else f"{cell(row.low_95)} to {cell(row.high_95)}"),
+            ("second mean larger in", lambda row: f"{row.larger_in} of {row.cultures}"),
+            ("significantly better in", "found_better"),
+        ],
+        note="Mean returns; each culture counts the same. Intervals are percentile bootstraps over cultures, too "
+        "narrow with fewer than ten. Second mean larger in: cultures in which the second arm's mean return is larger. "
+        f"Significantly better in: those in which it is better at p < {LEVEL:g}, as in their own reports.",
+        beside=SUMMARY,
+    )
+    picture = picture_of(
+        found.folder,
+        "over-cultures",
+        "Differences on each culture",
+        "Each point is a culture: the mean return of the second arm's policies minus that of the first's; to the right "
+        "of 0 the second arm is better. Above each row of points: their mean with its 95 % interval, of "
+        f"{counted(len(found.comparisons), 'culture')}.",
+        COMPARISONS,
+    )
+    return Section("Results in short", (), tuple(points), (arms_table(study), table), (picture,))
+
+
+def _describe(compared: Compared, row: OverCultures) -> str:
+    larger = (
+        f"“{compared.second}” has a larger mean return than “{compared.first}” in {row.larger_in} of "
+        f"{counted(row.cultures, 'culture')}"
+    )
+    if not row.tested:
+        return f"{larger}; with so few policies no test finds a difference in one culture."
+    return f"{larger}; it is found to be better (p < {LEVEL:g}) in {row.found_better}."

@@ -18,15 +18,8 @@ from animat.studies.tabulating import LEVEL
 
 AIM = 0.97
 """Normalised score from which an arm counts as being as good as its optimum allows."""
-
 PAPER_POLICIES = 10
 """Per arm. Source: Sawada et al. 2022."""
-
-_CULTURES = {
-    "virtual": "This one is simulated, grown from a seed, and calibrated to published figures of cortical cultures, "
-    "not to the paper's results. The size of its responses and their fatigue differ from the paper's.",
-    "files": "Here existing recordings are used.",
-}
 
 
 def decisions(study: Study, series: Sequence[Responses] = ()) -> tuple[tuple[str, str], ...]:
@@ -63,8 +56,15 @@ def _recorded(culture: Source) -> str:
 
 
 def _culture_decisions(study: Study) -> Iterator[tuple[str, str]]:
-    yield "The culture", f"The paper's was alive. {_CULTURES[study.culture.kind]}"
-    if study.culture.kind == "virtual":
+    if study.culture.kind == "files":
+        yield "The culture", "The paper's was alive. Here existing recordings are used."
+    else:
+        yield (
+            "The culture",
+            "The paper's was alive. This one is simulated, grown from a seed, and calibrated to published figures of "
+            "cortical cultures, not to the paper's results. The size of its responses and their fatigue differ from "
+            "the paper's.",
+        )
         yield (
             "Pulse",
             "As published, the pulse's phases do not balance (100 against 80 mV ms). The virtual culture accepts it "

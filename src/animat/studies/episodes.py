@@ -1,17 +1,27 @@
-"""The table of episodes, one row per episode, from which all returns are summarised."""
+"""A study's episodes: the table, one row per episode, that summaries are made of; and single ones with their paths."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+import jax
 import numpy as np
 import pandas as pd
-from jaxtyping import Float64
+from jaxtyping import Float, Float64, Int64
 from pandas import DataFrame as DataFrame
 
-from animat.evaluation.rollouts import Episodes
+from animat.environment import Environment
+from animat.evaluation.host_rollouts import paths_on_host
+from animat.evaluation.rollouts import Actor, Episodes, trace
+from animat.goals.robot import RobotWithGoal
+from animat.neurons.simulator import NeuronSimulator
+from animat.report.results import ObjectiveMet
+from animat.robots.host import HostRobot
 from animat.studies.results import read_arrays, write_arrays
+from animat.studies.specification import Study
 
 COLUMNS = ("robot", "arm", "agent", "actor", "at_min", "over_time", "episode", "return", "iterations", "ended")
 """Columns of the table, described in docs/studies.md; for controls `arm` is the `mapping_label` they act through.
@@ -77,3 +87,49 @@ def mean_returns(rows: DataFrame, episodes: int | None = None) -> Float64[np.nda
     """Each actor's mean return over its first episodes, or all: what the paper calls a policy's performance."""
     by_actor = rows.groupby("actor")["return"]
     return np.array([returns.to_numpy()[:episodes].mean() for _, returns in by_actor], np.float64)
+
+
+def goals_met(study: Study, table: DataFrame) -> Iterator[ObjectiveMet]:
+    """How far policies and controls met the goal of each robot at each minute, from the table of episodes."""
+    for spec in study.robots:
+        robot = spec.robot()
+        if not isinstance(robot, RobotWithGoal):
+            continue
+        at = rows_where(table, robot=spec.name, over_time=False)
+        for (arm, agent, at_min), rows in at.groupby(["arm", "agent", "at_min"], sort=False):
+            met = len(rows), float(rows[SUCCEEDED].mean()), float(rows[MARGIN].mean())
+            for i, objective in enumerate(robot.goal.objectives):
+                satisfaction = float(rows[f"{SATISFACTION}{i}"].mean())
+                yield ObjectiveMet(spec.name, arm, agent, at_min, *met, str(objective), satisfaction)
+
+
+@dataclass(frozen=True, eq=False)
+class Paths:
+    """One episode of each of several actors.
+
+    Attributes:
+        observations: before each iteration and after the last, shape (actors, iterations + 1, observations).
+        commands: u of each iteration, shape (actors, iterations), or (actors, iterations, commands) for several.
+        lengths: iterations of each episode, shape (actors,); observations and commands beyond them are meaningless.
+    """
+
+    observations: Float[np.ndarray, "actors iterations+1 observations"]
+    commands: Float[np.ndarray, "actors iterations *commands"]
+    lengths: Int64[np.ndarray, " actors"]
+
+    def episodes(self) -> list[tuple[np.ndarray, list[float]]]:
+        """Observations and commands of each actor, up to the end of its episode."""
+        return [
+            (observations[: length + 1], commands[:length].tolist())
+            for observations, commands, length in zip(self.observations, self.commands, self.lengths, strict=True)
+        ]
+
+
+def record_paths(environment: Environment[Any], simulator: NeuronSimulator | None, actors: Actor, seed: int) -> Paths:
+    """Run one episode of each actor; arguments as for `animat.evaluation.rollouts.roll_out`."""
+    if isinstance(environment.robot, HostRobot):
+        keys = jax.random.split(jax.random.key(seed), actors.n_actors)
+        return Paths(*paths_on_host(environment, simulator, actors, keys, seed))
+    traced = trace(environment, simulator, actors, episodes=1, seed=seed)
+    observations, commands, lengths = (each[:, 0] for each in (traced.observations, traced.commands, traced.lengths))
+    return Paths(observations, commands, lengths.astype(np.int64))

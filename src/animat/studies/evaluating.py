@@ -14,9 +14,8 @@ from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import SimulatorTimeline, load_timeline
 from animat.progress import Progress
 from animat.robots.host import HostRobot
-from animat.studies.episodes import COUPLING, RANDOM, episode_rows, write_episodes
-from animat.studies.paths import record_paths
-from animat.studies.places import TIMELINE, controls_file, episodes_file, paths_file, policies_folder
+from animat.studies.episodes import COUPLING, RANDOM, episode_rows, record_paths, write_episodes
+from animat.studies.folder import TIMELINE, controls_file, episodes_file, paths_file, policies_folder
 from animat.studies.results import write_arrays
 from animat.studies.specification import Arm, RobotSpec, Study, mapping_label
 from animat.studies.task import StudyTask, study_seed
@@ -63,9 +62,7 @@ class Control(StudyTask):
     """Run the controls of a mapping on a robot: random, constant, heuristic; with policies also silent and shuffled.
 
     The best coupling is run at the last recording only, as its search takes as long as all other controls together.
-
-    Attributes:
-        plain: arm that gives the mapping; its policies are used if it `is_usual`.
+    The arm `plain` gives the mapping; its policies are used if it `is_usual`.
     """
 
     sizes = ("policies", "episodes", "episodes_over_time")

@@ -1,4 +1,4 @@
-"""The folder of a study or a tuning: to which work it belongs, and that only one run uses it at a time."""
+"""The folder of a study or a tuning: its paths, to which work it belongs, and that only one run uses it at a time."""
 
 from __future__ import annotations
 
@@ -12,18 +12,27 @@ from typing import Any
 
 from animat.errors import InvalidArgument, Mismatch, as_invalid_file
 from animat.execution.receipts import sha256
-from animat.execution.task import NOTICES
+from animat.execution.task import NOTICES, UNFINISHED
 from animat.folders import first_difference, folder_mismatch, read_description, with_fingerprint
 from animat.goals.robot import without_goal
 from animat.plain_file import expect_no_file, expect_plain_file
 from animat.recordings.formats.csv import stimuli_beside
 from animat.recordings.reading import list_recordings
-from animat.studies.places import OWN_FOLDERS
-from animat.studies.specification import Study
+from animat.studies.specification import Arm, RobotSpec, Study
 from animat.training.folder import versions_of
 from animat.writing import clear_away, exclusive_lock, is_unfinished, write_whole
 
 MANIFEST = "study.json"
+RECORDINGS = "recordings"
+TIMELINE = "simulators/timeline.safetensors"
+RESPONSES = "simulators/responses.csv"
+RESULTS = "tables/results.json"
+REPORT = "report.html"
+RECEIPTS = "jobs"
+OWN_FOLDERS = (
+    RECORDINGS, "simulators", "policies", "episodes", "controls", "optima", "tables", "figures", RECEIPTS, UNFINISHED,
+)  # fmt: skip
+"""All folders that a study makes in its folder; its other files are the report, the specification and its manifest."""
 _PACKAGES = (
     "animat", "jax", "jaxlib", "numpy", "scipy", "optax", "numba", "h5py", "pynwb", "pandas", "pillow", "matplotlib",
     "jinja2",
@@ -120,18 +129,44 @@ def _is_claimed(folder: Path, what: str, manifest: dict[str, Any], files: list[s
     """Whether the folder already belongs to this work, whose description is the first of its files, or is free."""
     found = read_description(folder / files[0], what)
     if found is None:
-        if folder.is_dir() and not all(map(_is_hidden, folder.iterdir())):
+        # Hidden files are half written by a killed run, locks, or another program's.
+        if folder.is_dir() and not all(path.name.startswith(".") for path in folder.iterdir()):
             raise Mismatch(f"{folder}: expected an empty folder or one of this {what}, got one with other files in it")
         return False
     if found["fingerprint"] == manifest["fingerprint"]:
         return all((folder / name).exists() for name in files)
     # Work that stopped at its first step left only these files, and may be replaced.
-    left = (path for path in folder.rglob("*") if not path.is_dir() and not _is_hidden(path))
+    left = (path for path in folder.rglob("*") if not path.is_dir() and not path.name.startswith("."))
     if any(path.name not in files and path.parent.name != NOTICES for path in left):
         raise folder_mismatch(folder, what, first_difference(found, manifest, ignoring=("fingerprint",)))
     return False
 
 
-def _is_hidden(path: Path) -> bool:
-    """Whether a file may be ignored: half written by a killed run, a lock, or hidden by another program."""
-    return path.name.startswith(".")
+def policies_folder(folder: Path, spec: RobotSpec, arm: Arm) -> Path:
+    """The policies of an arm on a robot."""
+    return folder / "policies" / spec.name / arm.slug
+
+
+def episodes_file(folder: Path, spec: RobotSpec, arm: Arm) -> Path:
+    """The episodes of an arm's policies on a robot; each arm has its own folder, so that names cannot collide."""
+    return folder / "episodes" / spec.name / arm.slug / "episodes.npz"
+
+
+def paths_file(folder: Path, spec: RobotSpec, arm: Arm) -> Path:
+    """One complete episode of each of an arm's policies on a robot."""
+    return folder / "episodes" / spec.name / arm.slug / "paths.npz"
+
+
+def controls_file(folder: Path, spec: RobotSpec, arm: Arm) -> Path:
+    """The episodes of the controls of an arm's mapping on a robot."""
+    return folder / "controls" / spec.name / arm.thresholds / "episodes.npz"
+
+
+def optima_file(folder: Path, robot: str, what: str = "optima") -> Path:
+    """The optimal returns on a robot."""
+    return folder / "optima" / f"{robot}-{what}.json"
+
+
+def table_file(folder: Path, name: str) -> Path:
+    """A table of results as CSV."""
+    return folder / "tables" / f"{name}.csv"

@@ -16,9 +16,9 @@ from animat.report.results import StudyOptimum
 from animat.robots.base import lacking
 from animat.robots.grid import why_no_grid
 from animat.studies.evaluating import as_recorded, setting_of
-from animat.studies.places import optima_file
+from animat.studies.folder import optima_file
+from animat.studies.recording import read_series
 from animat.studies.results import read_typed, write_typed
-from animat.studies.simulating import read_series
 from animat.studies.specification import Arm, RobotSpec, Study
 from animat.studies.task import StudyTask
 
@@ -26,7 +26,6 @@ STEPS_OVER_TIME = 0.5
 """Grid steps along each axis for the optima of every recording, as a fraction of those elsewhere."""
 STEPS_BOOTSTRAPPED = 0.8
 """Grid steps along each axis for bootstrapped responses, at most, as a fraction of the optimum's."""
-
 _COPIED = ("grid_error", "monte_carlo", "standard_error", "without_clock", "without_clock_standard_error", "nodes")
 """Columns of the table that an `Optimum` has under the same name."""
 
@@ -73,11 +72,8 @@ def missing_capabilities(study: Study) -> list[str]:
 class FindOptima(StudyTask):
     """Compute the optimal return on a robot for every mapping of the study, over conditions with enough responses.
 
-    For a robot without a grid the table is empty.
-
-    Attributes:
-        over_time: at every recording, on a coarse grid, without the controller's return and without an interval;
-            otherwise at the minutes at which anything is evaluated.
+    It is computed at the minutes at which anything is evaluated, or `over_time` at every recording, on a coarse grid,
+    without the controller's return and without an interval. For a robot without a grid the table is empty.
     """
 
     sizes = ("optimum_resolution", "optimum_episodes")
@@ -141,13 +137,7 @@ class FindOptima(StudyTask):
 
 @dataclass
 class _Request:
-    """An optimum to compute.
-
-    Attributes:
-        case: environment and simulator; None if no condition has enough responses.
-        counted: the responses of the simulator; None without neurons.
-        left_out: conditions with too few responses.
-    """
+    """An optimum to compute: `case` is None if no condition has enough responses, `counted` None without neurons."""
 
     kind: Arm
     at_min: float

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from animat.arguments import checked_arguments
 from animat.studies.source import Source
@@ -56,26 +56,24 @@ def paper_study(culture_seed: int = 1, seed: int = 1, *, quick: bool = False) ->
         seed: decides every draw of training and evaluation.
         quick: all steps with fewer policies, iterations and recordings: a first look, not a result.
     """
-    if not quick:
-        return Study(
-            title="The paper's study on a virtual culture",
-            culture=Source(seed=culture_seed),
-            # On navigation's grid a resolution of 0.6 leaves an error of 0.01.
-            robots=(RobotSpec("cartpole"), RobotSpec("navigation", optimum_resolution=0.6)),
-            arms=ARMS,
-            comparisons=COMPARISONS,
-            seed=seed,
-            paper=True,
-        )
-    return Study(
-        title="The paper's study on a virtual culture, in short",
-        culture=Source(seed=culture_seed, sessions=8, interval_min=20.0),
-        robots=(RobotSpec("cartpole", iterations=60_000), RobotSpec("navigation", iterations=60_000)),
+    study = Study(
+        title="The paper's study on a virtual culture",
+        culture=Source(seed=culture_seed),
+        # On navigation's grid a resolution of 0.6 leaves an error of 0.01.
+        robots=(RobotSpec("cartpole"), RobotSpec("navigation", optimum_resolution=0.6)),
         arms=ARMS,
         comparisons=COMPARISONS,
-        policies=4,
         seed=seed,
+        paper=True,
+    )
+    if not quick:
+        return study
+    return replace(
+        study,
+        title=f"{study.title}, in short",
+        culture=replace(study.culture, sessions=8, interval_min=20.0),
+        robots=(RobotSpec("cartpole", iterations=60_000), RobotSpec("navigation", iterations=60_000)),
+        policies=4,
         optimum_resolution=0.5,
         optimum_episodes=1000,
-        paper=True,
     )

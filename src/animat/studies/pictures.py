@@ -1,49 +1,49 @@
-"""Jobs that draw the report's figures of the culture and of every robot, as PNG, SVG and PDF, with their numbers."""
+"""Jobs that draw the report's figures of the culture and of every robot, as PNG, SVG and PDF, with their numbers.
+
+Numbers that only figures show are written from the arrays that are drawn, to a table of the figure's name.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
-from typing import final
+from typing import Any, final
 
 import numpy as np
 
+from animat.lazy import Figure
 from animat.neurons.timeline import SimulatorTimeline
 from animat.progress import Progress
 from animat.recordings.reading import read_recordings
+from animat.recordings.recording import Recording
 from animat.records import read_record
-from animat.report.array import draw_array
-from animat.report.burst_separation import draw_burst_separation
+from animat.report.array import draw_array, rates_of_sites
 from animat.report.comparisons import Pair, draw_comparisons
 from animat.report.controls import draw_controls
-from animat.report.drift import draw_drift, drift_of
+from animat.report.drift import PERCENTILES, Drift, draw_drift, drift_of
 from animat.report.episodes import draw_frames, draw_paths
-from animat.report.learning_curves import LearningCurve, draw_learning_curves, over_rounds
-from animat.report.over_time import Courses, draw_over_time
-from animat.report.psth import draw_psth
-from animat.report.raster import draw_raster
-from animat.report.response_histograms import draw_response_histograms
-from animat.report.responses_over_time import draw_responses_over_time
+from animat.report.over_time import Courses, LearningCurve, draw_learning_curves, draw_over_time, over_rounds
+from animat.report.response_histograms import draw_burst_separation, draw_response_histograms, draw_responses_over_time
 from animat.report.results import ComparedReturns, ControlReturns, Results
-from animat.report.style import Figure
-from animat.responses.psth import post_stimulus_histogram, spontaneous_rate
+from animat.report.spikes import draw_psth, draw_raster
+from animat.report.style import save_formats
+from animat.responses.psth import PostStimulusHistogram, post_stimulus_histogram, spontaneous_rate
+from animat.responses.responses import Responses
 from animat.robots.base import lacking
-from animat.studies import figure_tables
-from animat.studies.episodes import POLICY, mean_returns, rows_where
+from animat.studies.episodes import POLICY, Paths, mean_returns, rows_where
 from animat.studies.evaluating import as_recorded
-from animat.studies.figures import save_formats
+from animat.studies.folder import RECORDINGS, RESULTS, paths_file, table_file
 from animat.studies.optima import kinds_of
-from animat.studies.paths import Paths
-from animat.studies.places import RECORDINGS, paths_file, results_file
-from animat.studies.results import read_arrays, read_typed
-from animat.studies.simulating import read_series
+from animat.studies.recording import read_series
+from animat.studies.results import read_arrays, read_typed, write_table
 from animat.studies.specification import Arm, RobotSpec, Study, mapping_label
 from animat.studies.tabulating import References, all_episodes, learning_of, performances
 from animat.studies.task import StudyTask
 from animat.studies.training import training_of
+from animat.tables import UNKNOWN
 from animat.training.settings import SAC
 from animat.training.specification import CHUNKS
 
@@ -68,28 +68,25 @@ class CulturePictures(StudyTask):
             "responses": draw_response_histograms(responses, series[-1] if len(series) > 1 else None),
         }
         tables = [
-            figure_tables.write_psth(folder, histogram, responses.window_ms, spontaneous_hz),
-            figure_tables.write_bursts(folder, series),
-            figure_tables.write_conditions(folder, series),
+            write_psth(folder, histogram, responses.window_ms, spontaneous_hz),
+            write_bursts(folder, series),
+            write_conditions(folder, series),
         ]
         progress.update(0.3, 1, "first recording")
         if first.channels.has_positions:
             figures["array"] = draw_array(first)
-            tables.append(figure_tables.write_array(folder, first))
+            tables.append(write_array(folder, first))
         if len(series) > 1:
             figures["over-time"] = draw_responses_over_time(series)
             figures["drift"] = draw_drift(series)
-            tables.append(figure_tables.write_drift(folder, drift_of(series)))
+            tables.append(write_drift(folder, drift_of(series)))
         return tables + _save(folder, "culture", figures, progress)
 
 
 @final
 @dataclass(frozen=True)
 class RobotPictures(StudyTask):
-    """Draw learning, comparisons, returns over the recordings, controls, paths and frames of one robot.
-
-    Numbers that no other table has are written to tables: learning with its intervals, returns over time, and paths.
-    """
+    """Draw learning, comparisons, returns over the recordings, controls, paths and frames of one robot."""
 
     spec: RobotSpec
 
@@ -98,7 +95,7 @@ class RobotPictures(StudyTask):
         study, timeline, *_ = as_recorded(self.study, folder)
         table = all_episodes(study, folder, [self.spec])
         known = References(study, folder, self.spec, table)
-        results = read_typed(results_file(folder), Results)
+        results = read_typed(folder / RESULTS, Results)
         # For every recording, with the optimum on a coarse grid.
         coarse = References(study, folder, self.spec, table, over_time=True) if study.needs_neurons else known
         figures: dict[str, Figure] = {}
@@ -106,7 +103,7 @@ class RobotPictures(StudyTask):
         curves = _curves(known, coarse, timeline)
         if curves:
             figures["learning"] = draw_learning_curves(curves, f"{name}: learning")
-            tables.append(figure_tables.write_learning(folder, name, curves))
+            tables.append(write_learning(folder, name, curves))
         if study.comparisons:
             pairs = [_pair(row, known) for row in results.comparisons if row.robot == name]
             figures["comparisons"] = draw_comparisons(pairs, f"{name}: comparisons")
@@ -114,14 +111,12 @@ class RobotPictures(StudyTask):
             courses = _courses(known, coarse, timeline)
             until_min = float(timeline.start_min[0]) + study.training_min
             figures["over-time"] = draw_over_time(courses, f"{name}: at every recording", trained_until_min=until_min)
-            tables.append(figure_tables.write_courses(folder, name, courses))
+            tables.append(write_courses(folder, name, courses))
         progress.update(0.2, 1, "controls")
         controls = _controls(row for row in results.controls if row.robot == name)
         figures["controls"] = draw_controls(controls, f"{name}: controls")
         recorded = {each.name: Paths(**read_arrays(paths_file(folder, self.spec, each))) for each in study.arms}
-        tables.append(
-            figure_tables.write_paths(folder, name, [quantity.name for quantity in robot.observation_spec], recorded)
-        )
+        tables.append(write_paths(folder, name, [quantity.name for quantity in robot.observation_spec], recorded))
         paths = {arm: of.episodes() for arm, of in recorded.items()}
         lacks = lacking(robot)
         if "draw_paths" not in lacks:
@@ -203,3 +198,107 @@ def _controls(rows: Iterable[ControlReturns]) -> list[tuple[str, list[ControlRet
         at = "" if mapping == "none" else f", recording at {at_min:g} min"
         panels.append((f"{mapping_label(mapping, percentiles)}{at}", list(same)))
     return panels
+
+
+def write_psth(
+    folder: Path, histogram: PostStimulusHistogram, window_ms: tuple[float, float], spontaneous_hz: float
+) -> Path:
+    """The histogram of the first recording, one row per bin; `in_window`: the bin's share in the response window."""
+    from_ms, to_ms = histogram.edges_ms[:-1], histogram.edges_ms[1:]
+    inside_ms = np.clip(np.minimum(to_ms, window_ms[1]) - np.maximum(from_ms, window_ms[0]), 0.0, None)
+    head = ("from_ms", "to_ms", "in_window", "spikes", "stimuli", "channels", "rate_hz_per_channel")
+    columns = (from_ms, to_ms, inside_ms / (to_ms - from_ms), histogram.count, histogram.rate_hz)
+    rows = (
+        (*bounds, inside, count, histogram.n_stimuli, histogram.n_channels, rate_hz, spontaneous_hz)
+        for *bounds, inside, count, rate_hz in zip(*(column.tolist() for column in columns), strict=True)
+    )
+    return _write(folder, "culture-psth", (*head, "spontaneous_hz_per_channel"), rows)
+
+
+def write_bursts(folder: Path, series: Sequence[Responses]) -> Path:
+    """Burst separation in every recording; a response whose ratio of active channels is above the threshold is one."""
+    head = ("at_min", "responses", "bursts", "burst_share", "threshold_active_ratio", "separability", "channels")
+    rows = []
+    for responses in series:
+        n, bursts = len(responses), int(np.count_nonzero(responses.is_burst))
+        counts = (responses.start_min, n, bursts, bursts / n if n else None)
+        rows.append((*counts, responses.threshold, responses.separability, responses.n_channels))
+    return _write(folder, "culture-bursts", head, rows)
+
+
+def write_conditions(folder: Path, series: Sequence[Responses]) -> Path:
+    """The non-burst responses to every condition in every recording: how many, median, and P(x >= P50 of all)."""
+    head = ("at_min", "condition", "value", "unit", "non_bursts", "median_hz", "above_median")
+    rows = []
+    for responses in series:
+        for i, share in enumerate(responses.shares_above_median().tolist()):
+            condition, x = responses.conditions[i], responses.rates_of(i)
+            of_condition = condition.label, condition.value, condition.unit
+            rows.append((responses.start_min, *of_condition, len(x), float(np.median(x)) if len(x) else None, share))
+    return _write(folder, "culture-conditions", head, rows)
+
+
+def write_drift(folder: Path, drift: Drift) -> Path:
+    """Percentiles of the non-burst responses to all conditions, and the share of bursts, at every recording."""
+    head = ("at_min", *(f"p{percent}_hz" for percent in PERCENTILES), "burst_share")
+    columns = (drift.minutes, *drift.percentiles_hz.T, drift.bursts)
+    return _write(folder, "culture-drift", head, zip(*(column.tolist() for column in columns), strict=True))
+
+
+def write_array(folder: Path, recording: Recording) -> Path:
+    """Every recording site of the first recording with its rate, and stimulated electrodes that no channel reads."""
+    channels, electrodes = recording.channels, recording.stimuli.electrodes
+    stimulated = set(electrodes[electrodes != UNKNOWN].tolist())
+    columns = (channels.label, channels.electrode, channels.x_um, channels.y_um, rates_of_sites(recording))
+    rows: list[tuple[Any, ...]] = [
+        (label, None if electrode == UNKNOWN else electrode, *numbers, int(electrode in stimulated))
+        for label, electrode, *numbers in zip(*(column.tolist() for column in columns), strict=True)
+    ]
+    unread = sorted(stimulated - set(channels.electrode.tolist()))
+    rows += [(None, electrode, None, None, None, 1) for electrode in unread]
+    return _write(folder, "culture-array", ("channel", "electrode", "x_um", "y_um", "rate_hz", "is_stimulated"), rows)
+
+
+def write_learning(folder: Path, robot: str, curves: Sequence[LearningCurve]) -> Path:
+    """Learning curves as means over policies with their 95 % intervals, with random actions and the optimum."""
+    head = ("arm", "iterations", "policies", "mean_return", "low_95", "high_95", "random", "optimum")
+    rows: list[tuple[Any, ...]] = []
+    for curve in curves:
+        ended = np.count_nonzero(np.isfinite(curve.returns), axis=0).tolist()
+        interval = (column.tolist() for column in curve.mean_with_interval())
+        levels = ([None] * len(ended) if each is None else each.tolist() for each in (curve.random, curve.optimum))
+        iterations = (int(done) for done in curve.iterations)
+        rows += [(curve.name, *row) for row in zip(iterations, ended, *interval, *levels, strict=True)]
+    return _write(folder, f"{robot}-learning", head, rows)
+
+
+def write_courses(folder: Path, robot: str, panels: Sequence[Courses]) -> Path:
+    """Quartiles over policies of every arm at every recording, with random actions and the optima."""
+    head = ("mapping", "arm", "at_min", "policies", "lower_quartile", "median", "upper_quartile", "random")
+    rows = []
+    for panel in panels:
+        for arm, returns in panel.returns.items():
+            for i, at_min in enumerate(panel.minutes.tolist()):
+                levels = (None if each is None else float(each[i]) for each in (panel.random, panel.optimum))
+                known = panel.title, arm, at_min, len(returns), *panel.quartiles(arm)[:, i].tolist()
+                rows.append((*known, *levels, panel.fine_optimum.get(at_min)))
+    return _write(folder, f"{robot}-over-time", (*head, "optimum_rough_grid", "optimum_fine_grid"), rows)
+
+
+def write_paths(folder: Path, robot: str, names: Sequence[str], paths: Mapping[str, Paths]) -> Path:
+    """One episode of each policy of every arm: observations, and the command or commands that led to each."""
+    n = max(math.prod(of.commands.shape[2:]) for of in paths.values())
+    heads = ["command"] if n == 1 else [f"command_{number}" for number in range(1, n + 1)]
+    rows = (
+        (arm, f"p{actor}", i, *observed.tolist(), *(np.ravel(commands[i - 1]).tolist() if i else [None] * n))
+        for arm, of in paths.items()
+        for actor, (observations, commands) in enumerate(of.episodes())
+        for i, observed in enumerate(observations)
+    )
+    return _write(folder, f"{robot}-paths", ("arm", "policy", "iteration", *names, *heads), rows)
+
+
+def _write(folder: Path, name: str, head: Sequence[str], rows: Iterable[Sequence[Any]]) -> Path:
+    """Write a table with NaN as empty cells."""
+    known = ([None if isinstance(cell, float) and math.isnan(cell) else cell for cell in row] for row in rows)
+    return write_table(table_file(folder, name), head, known)

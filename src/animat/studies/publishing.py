@@ -9,33 +9,25 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, final
 
-import numpy as np
-from jaxtyping import Float64
-
 from animat.errors import counted
 from animat.evaluation.statistics import p_of_u
 from animat.neurons.fidelity import Fidelity
 from animat.neurons.timeline import load_timeline
 from animat.progress import Progress
 from animat.report.headline import draw_headline
-from animat.report.html import Picture, Section, Table, cell, write_page
+from animat.report.html import Picture, Section, Table, cell, picture_of, write_page
 from animat.report.results import ComparedReturns, ControlReturns, Results, Score
-from animat.report.style import save_figure
+from animat.report.style import save_figure, save_formats
 from animat.responses.responses import Responses
 from animat.studies import report_tables
 from animat.studies.arms import arm_differences, arms_table, describe_mapping, summarise_arms
 from animat.studies.captions import BURSTS, CULTURE, HEADLINE, NO_BURSTS, ROBOT, Caption
 from animat.studies.differences import decisions, differing_comparisons
-from animat.studies.episodes import DataFrame
-from animat.studies.figures import picture_of, save_formats
-from animat.studies.folder import MANIFEST
-from animat.studies.goals import goals_table
-from animat.studies.heuristic import not_outperforming
+from animat.studies.folder import MANIFEST, REPORT, RESULTS, TIMELINE
+from animat.studies.outperforming import describe_reflexes, not_outperforming
 from animat.studies.pictures import round_of
-from animat.studies.places import REPORT, TIMELINE, results_file
-from animat.studies.reflex import describe_reflexes
+from animat.studies.recording import controllability, read_series
 from animat.studies.results import read_typed
-from animat.studies.simulating import controllability, read_series
 from animat.studies.specification import Arm, Study
 from animat.studies.tabulating import FIRST, LEFT_OUT, LEVEL, NONE, SECOND, all_episodes, performances
 from animat.studies.task import StudyTask
@@ -49,13 +41,16 @@ class Publish(StudyTask):
 
     def make(self, folder: Path, progress: Progress) -> list[Path]:
         study, manifest = self.study, json.loads((folder / MANIFEST).read_text())
-        results = read_typed(results_file(folder), Results)
+        results = read_typed(folder / RESULTS, Results)
         kept: dict[float, Fidelity] = {}
         series: list[Responses] = []
         if study.needs_neurons:
             kept = controllability(load_timeline(folder / TIMELINE))
             series = read_series(study, folder, as_one=True)
-        headline = _headline(study, results, all_episodes(study, folder, study.robots))
+        table = all_episodes(study, folder, study.robots)
+        # Each arm at the last recording that it was evaluated on, as its scores are in the order of its minutes.
+        last = {(row.robot, row.arm): row for row in results.scores}.values()
+        headline = [(row, performances(table, row.robot, study.arm(row.arm), row.at_min, row.episodes)) for row in last]
         drawn = save_formats(draw_headline(headline), folder, "figures/headline")
         narrow = save_figure(draw_headline(headline, narrow=True), folder / "figures" / "headline-narrow.png")
         title, caption = "Every arm on every robot", HEADLINE.format(**_facts_of(study))
@@ -65,9 +60,9 @@ class Publish(StudyTask):
             pictures = _pictures(folder, spec.name, ROBOT, {**_facts_of(study), "round": f"{round_of(study, spec):,}"})
             sections.append(Section(_begin(spec.name), pictures=pictures))
         if kept:
-            table = report_tables.controllability_table(study, folder, kept)
+            tables = (report_tables.controllability_table(study, folder, kept),)
             pictures = _pictures(folder, "culture", CULTURE, _facts_of_culture(series))
-            sections.append(Section("The culture", tables=(table,), pictures=pictures))
+            sections.append(Section("The culture", tables=tables, pictures=pictures))
         sections += [_controls(study, results), _compared(study, results), _scores(results)]
         if study.paper:
             sections.append(_differences(study, results, kept, series))
@@ -117,15 +112,6 @@ def _found_better(rows: Sequence[ComparedReturns]) -> str:
     if len(rows) == 1:
         return f"The second arm was {'' if found else 'not '}found to be better."
     return f"In {found} of {len(rows)} comparisons the second arm was found to be better."
-
-
-def _headline(study: Study, results: Results, table: DataFrame) -> list[tuple[Score, Float64[np.ndarray, " policies"]]]:
-    """Each arm on each robot at the last recording that it was evaluated on, with the mean return of each policy."""
-    # Scores of an arm are in the order of its minutes.
-    last = {(row.robot, row.arm): row for row in results.scores}
-    return [
-        (row, performances(table, row.robot, study.arm(row.arm), row.at_min, row.episodes)) for row in last.values()
-    ]
 
 
 def _summary(study: Study, results: Results, headline: Sequence[Score], picture: Picture) -> Section:
@@ -236,9 +222,9 @@ def _scores(results: Results) -> Section:
     note = (
         "Means over policies; the interquartile mean is that of the middle half, with its 95 % interval by Student's t."
     )
-    goals = (goals_table(results.goals),) if results.goals else ()
+    goals = (report_tables.goals_table(results),) if results.goals else ()
     optima = report_tables.optima_table(results.optima)
-    return Section("Scores", (note,), tables=(report_tables.scores_table(results.scores), optima, *goals))
+    return Section("Scores", (note,), tables=(report_tables.scores_table(results), optima, *goals))
 
 
 def _facts_of(study: Study) -> dict[str, str]:
@@ -288,13 +274,13 @@ def _controls(study: Study, results: Results) -> Section:
             "The best reflex: a fixed rule from sensed values to a stimulus, without memory and without a goal.",
         ),
     )
-    comparisons = report_tables.heuristic_table(results.heuristic), report_tables.reflexes_table(results.reflexes)
+    comparisons = report_tables.heuristic_table(results), report_tables.reflexes_table(results)
     sentences = [*(f"{each}." for each in not_outperforming(results)), *describe_reflexes(results.reflexes)]
     return Section(
         "Is it the culture?",
         ("Each control removes something.", *map(_begin, sentences)),
         points,
-        (*(table for table in comparisons if table.rows), report_tables.controls_table(study, results.controls)),
+        (*(table for table in comparisons if table.rows), report_tables.controls_table(study, results)),
     )
 
 

@@ -8,17 +8,10 @@ from typing import Any
 
 from animat.neurons.fidelity import LARGEST_LOSS, Fidelity
 from animat.report.html import Columns, Table, cell, columns_of, table_of, with_error
-from animat.report.results import (
-    ComparedReturns,
-    ControlReturns,
-    HeuristicComparison,
-    ReflexComparison,
-    Score,
-    StudyOptimum,
-)
+from animat.report.results import ComparedReturns, Results, StudyOptimum
 from animat.responses.quality.responses import FEW_SAMPLES
-from animat.studies.heuristic import NOT
 from animat.studies.optima import complete_optima, key_of, kinds_over_time, read_optima
+from animat.studies.outperforming import NOT
 from animat.studies.specification import Study, mapping_label
 from animat.studies.tabulating import FIRST, LEVEL, SECOND
 
@@ -36,9 +29,7 @@ _SCORE_NOTE = (
 def comparisons_table(rows: Sequence[ComparedReturns]) -> Table:
     """Tests and outcomes, with the paper's p where it printed one."""
     columns: Columns = [
-        *columns_of("comparison", "robot"),
-        ("at (min)", "at_min"),
-        ("n", "n"),
+        *columns_of("comparison", "robot", "at_min", "n"),
         ("U", "u"),
         ("p", "p_normal"),
         ("p exact", "p_exact"),
@@ -71,15 +62,13 @@ def returns_table(rows: Sequence[ComparedReturns]) -> Table:
     )
 
 
-def scores_table(rows: Sequence[Score]) -> Table:
+def scores_table(results: Results) -> Table:
     """Every arm at every minute at which it was evaluated."""
     return table_of(
         "Every arm",
-        rows,
+        results.scores,
         [
-            *columns_of("robot", "arm"),
-            ("at (min)", "at_min"),
-            *columns_of("policies", "episodes"),
+            *columns_of("robot", "arm", "at_min", "policies", "episodes"),
             ("mean", "mean_return"),
             ("s.d.", "standard_deviation"),
             ("interquartile mean", _interval("interquartile_mean", "low_95", "high_95")),
@@ -96,7 +85,7 @@ def optima_table(optima: Sequence[StudyOptimum]) -> Table:
     columns: Columns = [
         ("robot", "robot"),
         ("mapping", lambda row: mapping_label(row.mapping, row.percentiles)),
-        ("at (min)", "at_min"),
+        *columns_of("at_min"),
         ("optimum ± grid", _pair("best_return", "grid_error")),
         ("95 % interval", lambda row: None if row.low_95 is None else _ends(row.low_95, row.high_95)),
         ("its controller, run", _pair("monte_carlo", "standard_error")),
@@ -162,18 +151,18 @@ def controllability_table(study: Study, folder: Path, kept: Mapping[float, Fidel
     return Table(title, head, tuple(rows), note=note, beside=file, marked=tuple(marked))
 
 
-def controls_table(study: Study, rows: Sequence[ControlReturns]) -> Table:
+def controls_table(study: Study, results: Results) -> Table:
     """Trained policies and the controls of their mapping, at every recording at which anything is evaluated."""
     note = (
         "Trained policies are listed with their controls, as in the figures above. ±: standard error over actors; for "
         "one actor, over its episodes. Silent and shuffled (also if trained so) have no score: their optimum differs."
     )
     any_command = any(spec.robot().baseline_commands is None for spec in study.robots)
-    if any_command and any(row.mapping == "none" for row in rows):
+    if any_command and any(row.mapping == "none" for row in results.controls):
         note += " Without neurons, where any command can be chosen, there is no constant control."
     return table_of(
         "Controls",
-        rows,
+        results.controls,
         [
             ("robot", "robot"),
             ("mapping", lambda row: mapping_label(row.mapping, row.percentiles)),
@@ -185,18 +174,34 @@ def controls_table(study: Study, rows: Sequence[ControlReturns]) -> Table:
         ],
         note=note,
         beside="tables/controls.csv",
-        folded=len(rows) > _MOST_ROWS,
+        folded=len(results.controls) > _MOST_ROWS,
     )
 
 
-def heuristic_table(rows: Sequence[HeuristicComparison]) -> Table:
+def goals_table(results: Results) -> Table:
+    """One row for each objective, arm and control."""
+    return table_of(
+        "Goals",
+        results.goals,
+        [
+            *columns_of("robot", "arm", "agent", "at_min", "episodes"),
+            ("success", "success_share"),
+            *columns_of("margin", "objective"),
+            ("satisfied (%)", "satisfaction"),
+        ],
+        note="Means over all episodes. Success: share of episodes. Margin: how far an episode was from failing its "
+        "goal, or from meeting it, in scales of the quantities: above 0 if it succeeded, and the larger the better.",
+        beside="tables/goals.csv",
+    )
+
+
+def heuristic_table(results: Results) -> Table:
     """Trained policies and the heuristic policy, compared over episodes."""
     return table_of(
         "Policies and the heuristic policy",
-        rows,
+        results.heuristic,
         [
-            *columns_of("robot", "arm"),
-            ("at (min)", "at_min"),
+            *columns_of("robot", "arm", "at_min"),
             ("policies", "mean_return"),
             *columns_of("heuristic", "p"),
             ("pairs won", "wins"),
@@ -205,18 +210,17 @@ def heuristic_table(rows: Sequence[HeuristicComparison]) -> Table:
         note="p: Mann-Whitney over episodes, two-sided. Pairs won: share of pairs of episodes in which the policies' "
         "return is larger, ties counting half. Highlighted: learning did no better than the heuristic policy.",
         beside="tables/heuristic.csv",
-        marked=tuple(i for i, row in enumerate(rows) if row.outcome == NOT),
+        marked=tuple(i for i, row in enumerate(results.heuristic) if row.outcome == NOT),
     )
 
 
-def reflexes_table(rows: Sequence[ReflexComparison]) -> Table:
+def reflexes_table(results: Results) -> Table:
     """Trained policies and the best coupling: context gap and context score."""
     return table_of(
         "Policies and the best reflex",
-        rows,
+        results.reflexes,
         [
-            *columns_of("robot", "arm"),
-            ("at (min)", "at_min"),
+            *columns_of("robot", "arm", "at_min"),
             ("best coupling", _pair("coupling", "coupling_standard_error")),
             ("optimum", "optimum"),
             ("context gap", _interval("gap", "gap_low_95", "gap_high_95")),

@@ -1,4 +1,4 @@
-"""Running a study: does the missing jobs, in parallel, until its folder is complete."""
+"""Running a study: its jobs and their dependencies, and doing the missing ones until its folder is complete."""
 
 from __future__ import annotations
 
@@ -19,24 +19,19 @@ from animat.execution.jobs import Job, Jobs, expect_workers
 from animat.execution.task import UNFINISHED
 from animat.progress import Progress, Silent
 from animat.robots.checking import check_robot
-from animat.studies.folder import MANIFEST, claim_folder, describe_study, hash_files, source_files
-from animat.studies.places import RECEIPTS, REPORT
-from animat.studies.plan import plan_study
-from animat.studies.specification import RobotSpec, Study
+from animat.studies.folder import MANIFEST, RECEIPTS, REPORT, claim_folder, describe_study, hash_files, source_files
+from animat.studies.specification import Arm, RobotSpec, Study
 from animat.studies.toml import study_to_toml
 
 SPECIFICATION = "study.toml"
+ITERATIONS_PER_S = 110_000
+"""Training speed on one core, all policies of a group together; used only to order jobs and estimate the time left."""
 _ABOUT_FILES = "# files: relative to the original specification. To run it from here: files = ['recordings']\n"
 
 
 @dataclass(frozen=True)
 class StudyRun:
-    """The result of running a study.
-
-    Attributes:
-        jobs: number of jobs of the study.
-        done_now: processor seconds of each job that this run did; empty if the folder was finished.
-    """
+    """A study's folder and report, its number of jobs, and the CPU seconds of those that this run did, by name."""
 
     folder: Path
     report: Path
@@ -86,6 +81,61 @@ def run_study(
         how = {"workers": workers, "executor": executor, "has_gpu": gpu is not None}
         took_s = run_jobs(jobs, folder, manifest["fingerprint"], progress, **how)
     return StudyRun(folder, folder / REPORT, len(jobs), took_s)
+
+
+def plan_study(study: Study, base: Path) -> list[Job]:
+    """All jobs of a study, whose files are relative to `base`."""
+    # Tasks import JAX, which the command line should not load.
+    from animat.studies.evaluating import Control, Evaluate
+    from animat.studies.optima import FindOptima, kinds_of
+    from animat.studies.pictures import CulturePictures, RobotPictures
+    from animat.studies.publishing import Publish
+    from animat.studies.recording import JOB, Fit, Record
+    from animat.studies.tabulating import Tabulate
+    from animat.studies.training import TrainGroup
+    from animat.training.group import split_groups
+
+    jobs: list[Job] = []
+    neurons: tuple[str, ...] = ()
+    if study.needs_neurons:
+        sessions = study.culture.sessions
+        jobs += [
+            Job(JOB, Record(study, base), (), 2 + (2.5 if study.culture.kind == "virtual" else 0.3) * sessions),
+            Job("fit", Fit(study), (JOB,), 3),
+            Job("pictures/culture", CulturePictures(study), (JOB, "fit"), 15),
+        ]
+        neurons = ("fit",)
+    results: list[str] = []
+    for spec in study.robots:
+        of_robot: list[Job] = []
+        groups: dict[Arm, list[str]] = {arm: [] for arm in study.arms}
+        for arm, names in groups.items():
+            needs = neurons if arm.through_neurons else ()
+            for members in split_groups(study.policies):
+                names.append(f"train/{spec.name}/{arm.slug}/p{members[0]}")
+                trained_s = spec.trained_for * len(members) / ITERATIONS_PER_S if arm.trained else 0.0
+                of_robot.append(Job(names[-1], TrainGroup(study, spec, arm, members), needs, 4 + trained_s))
+            # The minute is the last recording's, even without neurons.
+            task = Evaluate(study, spec, arm)
+            of_robot.append(Job(f"evaluate/{spec.name}/{arm.slug}", task, (*names, *neurons), 4))
+        for kind in kinds_of(study):
+            # The most plainly trained arm of a kind represents it.
+            arms = study.arms_of(kind)
+            plain = max(arms, key=lambda arm: (arm.trained, arm.delivery == "chosen", arm.shadowing is True))
+            name = f"controls/{spec.name}/{kind.thresholds}"
+            of_robot.append(Job(name, Control(study, spec, plain), (*groups[plain], *neurons), 15))
+        resolution = spec.optimum_resolution or study.optimum_resolution
+        cost_s = 40 * resolution ** len(spec.robot().observation_spec) + 10
+        of_robot.append(Job(f"optimum/{spec.name}", FindOptima(study, spec), neurons, cost_s))
+        if neurons:
+            of_robot.append(Job(f"optimum/{spec.name}/over-time", FindOptima(study, spec, over_time=True), neurons, 12))
+        needs = (*(job.name for job in of_robot), *neurons, "tables")
+        jobs += [*of_robot, Job(f"pictures/{spec.name}", RobotPictures(study, spec), needs, 15)]
+        results += [job.name for job in of_robot]
+    jobs.append(Job("tables", Tabulate(study), (*results, *neurons), 2))
+    pictures = [job.name for job in jobs if job.name.startswith("pictures/")]
+    jobs.append(Job("report", Publish(study), (*pictures, "tables"), 1, (MANIFEST,)))
+    return jobs
 
 
 def run_jobs(

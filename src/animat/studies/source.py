@@ -17,7 +17,6 @@ from animat.stimulation.protocol import TWO_COMMANDS, Protocol
 MOST_SESSIONS, MOST_TRIALS, MOST_ENTRIES = 10_000, 1_000_000, 1_000
 """Limits of recordings, trials in each, and entries of a list; documented in `docs/studies.md`."""
 MOST_DIGITS = 9
-
 LISTED = Field(max_length=MOST_ENTRIES)
 
 

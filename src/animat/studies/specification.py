@@ -209,7 +209,6 @@ class Compared:
     """Two arms that are compared on every robot, by the policies' mean returns.
 
     Attributes:
-        name: of the comparison.
         first, second: names of arms; the second is expected to be better.
         at_min: minute whose nearest recording they are evaluated on; None: the last recording.
         episodes: of each policy.

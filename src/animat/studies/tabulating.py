@@ -17,27 +17,22 @@ from animat.neurons.timeline import SimulatorTimeline
 from animat.progress import Progress
 from animat.recordings.findings import Finding
 from animat.report.results import TRAINED, ComparedReturns, ControlReturns, Results, Score, StudyOptimum
-from animat.studies.episodes import POLICY, RANDOM, DataFrame, mean_returns, read_episodes, rows_where
+from animat.studies.episodes import POLICY, RANDOM, DataFrame, goals_met, mean_returns, read_episodes, rows_where
 from animat.studies.evaluating import as_recorded, policies_of
-from animat.studies.goals import goals_met
-from animat.studies.heuristic import compare_with_heuristic
+from animat.studies.folder import RESULTS, controls_file, episodes_file, table_file
 from animat.studies.optima import complete_optima, key_of, kinds_of, missing_capabilities, read_optima
+from animat.studies.outperforming import compare_with_heuristic, compare_with_reflex
 from animat.studies.paper import PRINTED
-from animat.studies.places import controls_file, episodes_file, results_file, table_file
-from animat.studies.reflex import compare_with_reflex
+from animat.studies.recording import controllability
 from animat.studies.results import write_records, write_table, write_typed
-from animat.studies.simulating import controllability
 from animat.studies.specification import Arm, RobotSpec, Study, mapping_label
 from animat.studies.task import StudyTask
 from animat.writing import atomic_write
 
 LEVEL = 0.01
 """The p below which an arm counts as better: by the normal approximation and uncorrected, as in the paper."""
-
 LEFT_OUT = "left-out"
 """The finding that the study lacks something, as a robot cannot do it."""
-
-CURVES = ("robot", "arm", "policy", "iterations", "episodes", "mean_return")
 
 
 @final
@@ -60,7 +55,7 @@ class Tabulate(StudyTask):
             goals=tuple(goals_met(study, table)),
             reflexes=tuple(row for spec in study.robots for row in compare_with_reflex(study, table, spec, optima)),
         )
-        files = [write_typed(results_file(folder), results)]
+        files = [write_typed(folder / RESULTS, results)]
         for name, kinds in get_type_hints(Results).items():
             rows = getattr(results, name)
             # Findings have other columns, below, and most studies have no goals.
@@ -68,7 +63,8 @@ class Tabulate(StudyTask):
                 files.append(write_records(table_file(folder, name), get_args(kinds)[0], rows))
         findings = ((finding.severity, finding.name, finding.message) for finding in results.findings)
         files.append(write_table(table_file(folder, "findings"), ("severity", "name", "message"), findings))
-        files.append(write_table(table_file(folder, "learning-curves"), CURVES, _curves(study, folder)))
+        columns = ("robot", "arm", "policy", "iterations", "episodes", "mean_return")
+        files.append(write_table(table_file(folder, "learning-curves"), columns, _curves(study, folder)))
         if timeline is not None:
             head = ("at_min", "condition", "above_median_in_data", "above_median_in_simulator")
             rows = (
@@ -178,7 +174,6 @@ def _scores(known: References, first: float, last: float) -> Iterator[Score]:
 
 FIRST, SECOND, NONE = "first better", "second better", f"none found (p ≥ {LEVEL:g})"
 TOO_FEW = "too few policies to tell"
-
 AS_IN_PAPER = {FIRST: "no", SECOND: "yes", NONE: "no", TOO_FEW: "cannot tell"}
 """Whether each outcome agrees with the paper, in which the second arm was always better."""
 

@@ -29,8 +29,6 @@ FORMER = {
     "algorithm": FORMER_SETTINGS,
 }
 """Former names of keys, by table ("" is the top level)."""
-FORMER_CHANNELS = 256
-"""Former files have this `channels` in every culture, which only synthetic recordings used; it is ignored."""
 
 
 @checked_arguments
@@ -39,9 +37,7 @@ def read_study(path: str | os.PathLike[str]) -> Study:
 
     Keys are the attributes of `animat.studies.specification.Study` and of the tables in it. A key that is left out has
     its default; an unknown key is refused. Lists in robots, arms and comparisons stand for all combinations.
-
-    Raises:
-        InvalidFile: naming the file, the key, what was expected and what came.
+    Raises InvalidFile, naming the file, the key, what was expected and what came.
     """
     return study_from(read_toml(path), path)
 
@@ -71,7 +67,8 @@ def _with_current_keys(data: dict[str, Any]) -> dict[str, Any]:
     data = _rename_keys(data, FORMER[""])
     data |= {name: _rename_keys(data[name], names) for name, names in FORMER.items() if name in data}
     culture = data.get("culture")
-    if isinstance(culture, dict) and culture.get("channels") == FORMER_CHANNELS:
+    # Former files have this in every culture, although only synthetic recordings used it.
+    if isinstance(culture, dict) and culture.get("channels") == 256:
         data["culture"] = {key: value for key, value in culture.items() if key != "channels"}
     return data
 

@@ -12,7 +12,7 @@ from animat.execution.task import UNFINISHED
 from animat.execution.training_task import TrainingTask, TrainingWork, train_alone
 from animat.neurons.timeline import SimulatorTimeline, load_timeline
 from animat.progress import Progress
-from animat.studies.places import TIMELINE, policies_folder
+from animat.studies.folder import TIMELINE, policies_folder
 from animat.studies.specification import Arm, RobotSpec, Study
 from animat.studies.task import StudyTask, study_seed
 from animat.training.folder import describe, provenance_of

@@ -12,12 +12,10 @@ from typing import Any
 
 from animat.report.style import save_figure
 from animat.report.tuning import draw_history, draw_importance
-from animat.studies.places import RECORDINGS
+from animat.studies.folder import RECORDINGS
 from animat.studies.toml import study_to_toml
-from animat.tuning.journal import TrialResult
-from animat.tuning.search import importance_of
-from animat.tuning.space import SEARCHABLE, THROUGH_NEURONS, Settings, with_settings
-from animat.tuning.specification import Tuning
+from animat.tuning.search import TrialResult, importance_of
+from animat.tuning.specification import SEARCHABLE, THROUGH_NEURONS, Settings, Tuning, with_settings
 from animat.writing import write_whole
 
 BEST, RESULTS, HISTORY, IMPORTANCE = "best.toml", "results.json", "history.png", "importance.png"
@@ -29,7 +27,6 @@ class Final:
 
     Attributes:
         trial: the trial that tried them first; 0: the study's own settings.
-        settings: the searched settings.
         returns: mean return of each policy in fresh episodes; None if a policy's parameters were not finite.
     """
 
@@ -55,10 +52,7 @@ class TuningResult:
     """The outcome of a tuning.
 
     Attributes:
-        folder: the folder of all its files.
-        best: the best final.
         finals: the study's own settings, the defaults if they were tried, then the best trials, best first.
-        trials: all trials.
         importance: share of each setting, the largest first; empty for fewer than four trials.
     """
 

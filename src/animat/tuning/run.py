@@ -19,19 +19,15 @@ from animat.execution.pinned import PinnedProcesses, own_cores
 from animat.execution.task import UNFINISHED
 from animat.folders import with_fingerprint
 from animat.progress import Part, Progress, Silent
-from animat.studies.folder import claim_folder, describe_study, hash_files, source_files
-from animat.studies.places import OWN_FOLDERS, RECEIPTS
-from animat.studies.plan import ITERATIONS_PER_S
+from animat.studies.folder import OWN_FOLDERS, RECEIPTS, claim_folder, describe_study, hash_files, source_files
 from animat.studies.recording import JOB, Record
-from animat.studies.run import check_custom
+from animat.studies.run import ITERATIONS_PER_S, check_custom
 from animat.studies.task import draw_seed
 from animat.training.group import split_groups
 from animat.training.specification import CHUNKS
-from animat.tuning.journal import TrialResult, read_journal, write_journal
 from animat.tuning.results import Final, TuningResult, write_results
-from animat.tuning.search import Search, expect_optuna
-from animat.tuning.space import choices_of, first_settings, with_settings
-from animat.tuning.specification import Tuning
+from animat.tuning.search import Search, TrialResult, expect_optuna, read_journal, write_journal
+from animat.tuning.specification import Tuning, choices_of, first_settings, with_settings
 from animat.tuning.tasks import Fit, TrainTrials, Trial, group_by_shape, returns_file, timeline_file
 
 MANIFEST = "tune.json"
@@ -52,17 +48,8 @@ def tune(
     If killed at any moment and called again, it continues; the journal and the results are the same, byte for byte,
     with any number of workers. For this, trials are proposed `together` at a time, and reported in order.
 
-    Args:
-        tuning: the specification.
-        folder: folder for all files; created if missing.
-        base, workers, executor, progress: as in `animat.studies.run.run_study`.
-
-    Raises:
-        Mismatch: if the folder holds another tuning, its recordings have changed, or another run is active in it.
-        InvalidFile: if a file cannot be read or written.
-        InvalidArgument: for fewer than one worker, or any with an executor.
-        UnusableData: if no trial had finite returns.
-        AnimatError: if Optuna is not installed, or if a task failed, which the message names.
+    Arguments and errors are those of `animat.studies.run.run_study`; also UnusableData if no trial had finite returns,
+    and AnimatError if Optuna is not installed.
     """
     expect_optuna()
     expect_workers(workers, executor)

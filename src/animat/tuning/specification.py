@@ -1,20 +1,179 @@
-"""The specification of a tuning: a study of one robot and one arm, and how its settings are searched."""
+"""The specification of a tuning: a study of one robot and one arm, and the space in which its settings are searched."""
 
 from __future__ import annotations
 
+import itertools
 import os
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Annotated, Any
 
 from pydantic import Field
 
-from animat.errors import InvalidArgument, InvalidFile, in_file
-from animat.records import Seed, Whole, read_record, record
+from animat.errors import InvalidArgument, InvalidFile, did_you_mean, in_file, shown, within
+from animat.records import Flag, Number, Seed, Whole, read_record, record
 from animat.robots.host import HostRobot
 from animat.studies.specification import Episodes, Study
 from animat.studies.toml import read_toml, study_from
+from animat.training.settings import SAC
 from animat.training.specification import CHUNKS
-from animat.tuning.space import Range, Space, default_space, read_space
+
+NUMBERS = ("learning_rate", "discount", "tau", "reward_scale", "initial_alpha", "target_entropy_ratio", "entropy_nats")
+"""Settings that a compiled program takes as numbers: trials that differ only in these share a program."""
+_OF_SIMULATORS = {"simulator": "kind", "conditions": "conditions", "readouts": "readouts"}
+"""Settings of a study's simulators, and the names of their fields."""
+THROUGH_NEURONS = ("mapping", *_OF_SIMULATORS)
+FITTING = ("environments", "replay")
+"""Settings of the algorithm that depend on each other: one is a multiple of the other."""
+SEARCHABLE = (*(field.name for field in fields(SAC)), *THROUGH_NEURONS)
+Value = float | int | str
+Settings = dict[str, Value]
+"""Settings by name: those of the algorithm, and `mapping`, `simulator`, `conditions`, `readouts`."""
+
+
+@record
+class Range:
+    """Numbers from `low` to `high`, uniform or, with `log`, uniform in the logarithm; integers for counts.
+
+    The logarithm of a discount is taken of its distance from 1: 0.9 to 0.99 is as far as 0.99 to 0.999.
+    """
+
+    low: Number
+    high: Number
+    log: Flag = False
+
+    def __post_init__(self) -> None:
+        if not self.low < self.high:
+            raise InvalidArgument(f"high: expected more than low ({self.low:g}), got {self.high:g}")
+        if self.log and self.low <= 0:
+            raise InvalidArgument(f"low: expected more than 0 with log = true, got {self.low:g}")
+
+    def __contains__(self, value: object) -> bool:
+        return isinstance(value, int | float) and self.low <= value <= self.high
+
+
+Space = dict[str, Range | tuple[Value, ...]]
+
+DEFAULT: Space = {
+    "learning_rate": Range(1e-4, 1e-2, True),
+    "discount": Range(0.9, 0.999, True),
+    "tau": Range(1e-3, 5e-2, True),
+    "reward_scale": Range(0.02, 1.0, True),
+    "initial_alpha": Range(0.01, 1.0, True),
+    "target_entropy_ratio": Range(0.02, 0.5, True),
+    "mapping": ("1-threshold", "9-thresholds", "linear"),
+    "simulator": ("histogram", "empirical", "memory"),
+}
+"""The default search; only what applies to the study is used, widened to include the study's own settings."""
+
+
+def default_space(study: Study) -> Space:
+    """The default search for a study with one robot and one arm."""
+    space, own = dict(DEFAULT), own_settings(study)
+    if not study.arms[0].through_neurons:
+        space = {name: among for name, among in space.items() if name not in THROUGH_NEURONS}
+        if study.robots[0].robot().baseline_commands is None:
+            del space["target_entropy_ratio"]
+            space["entropy_nats"] = Range(-3.0, 0.5)
+    for name, among in space.items():
+        value: Any = own[name]
+        if isinstance(among, Range):
+            # A range that reaches 0 has no logarithm, and is searched uniformly.
+            low, high = min(among.low, value), max(among.high, value)
+            space[name] = Range(low, high, among.log and low > 0 and not (name == "discount" and high == 1))
+        elif value not in among:
+            space[name] = (value, *among)
+    return space
+
+
+def read_space(table: Mapping[str, Any], study: Study) -> Space:
+    """The search of a file's `[tune.search]`: tables `{ low, high, log }` and lists of choices, by name.
+
+    Raises InvalidArgument for a setting that cannot be searched, an invalid range or list of choices, a value that the
+    setting cannot have, or a search that does not include the study's own setting, with which it begins.
+    """
+    if not table:
+        raise InvalidArgument("tune.search: expected at least one setting to search for, got none")
+    space: Space = {}
+    own = own_settings(study)
+    for name, among in table.items():
+        where = f"tune.search.{name}"
+        if name not in SEARCHABLE:
+            near = did_you_mean(name, SEARCHABLE) or f"; there are {', '.join(SEARCHABLE)}"
+            raise InvalidArgument(f"tune.search: expected names of settings, got {shown(name)}{near}")
+        if name in THROUGH_NEURONS and not study.arms[0].through_neurons:
+            raise InvalidArgument(f"{where}: expected none without neurons (mapping = 'none')")
+        if isinstance(among, dict):
+            if name in (*THROUGH_NEURONS, *FITTING):
+                raise InvalidArgument(f"{where}: expected a list of choices, got a table")
+            space[name] = read_record(Range, among, where)
+            if name == "discount" and among.get("log") and among["high"] == 1:
+                raise InvalidArgument(f"{where}: expected high below 1 with log = true, got 1")
+        elif isinstance(among, list) and len(among) > 1 and all(each not in among[:i] for i, each in enumerate(among)):
+            space[name] = tuple(_whole(each, own[name]) for each in among)
+        else:
+            raise InvalidArgument(
+                f"{where}: expected a range {{ low = ..., high = ... }} or a list of two or more different choices, "
+                f"got {shown(among)}"
+            )
+        if name not in FITTING:
+            _expect_possible(study, name, space[name], where)
+        if own[name] not in space[name]:
+            raise InvalidArgument(
+                f"{where}: expected it to include the study's own setting, {own[name]!r}, which is tried first; got "
+                f"{shown(among)}"
+            )
+    for chosen in itertools.product(*(choices_of(name, space, study) for name in FITTING)):
+        with within("tune.search"):
+            with_settings(study, dict(zip(FITTING, chosen, strict=True)))
+    return space
+
+
+def _expect_possible(study: Study, name: str, among: Range | tuple[Value, ...], where: str) -> None:
+    """Refuse a search with settings that the study could not run with; of a range its ends are checked."""
+    for value in (among.low, among.high) if isinstance(among, Range) else among:
+        with within(where):
+            if name == "mapping" and value == "none":
+                raise InvalidArgument("expected mappings, got 'none': tune policies without neurons separately")
+            with_settings(study, {name: _whole(value, own_settings(study)[name])})
+
+
+def _whole(value: Any, own: Any) -> Any:
+    """An integer if the study's own value is one, as TOML may have 64.0 for a count."""
+    return int(value) if isinstance(value, float) and isinstance(own, int) and value.is_integer() else value
+
+
+def own_settings(study: Study) -> dict[str, Any]:
+    """The values of all searchable settings in a study of one robot and one arm."""
+    return {
+        **asdict(SAC(**study.algorithm)),  # type: ignore[arg-type]
+        "mapping": study.arms[0].mapping,
+        **{name: getattr(study.simulators, field) for name, field in _OF_SIMULATORS.items()},
+    }
+
+
+def choices_of(name: str, space: Space, study: Study) -> tuple[Any, ...]:
+    """The choices of a setting; only the study's own if it is not searched."""
+    among = space.get(name)
+    return among if isinstance(among, tuple) else (own_settings(study)[name],)
+
+
+def first_settings(study: Study, space: Space) -> list[Settings]:
+    """The first settings to try: the study's own, and the algorithm's defaults if they differ and are in the search."""
+    own = own_settings(study)
+    defaults = {**own, **asdict(SAC())}
+    first, second = ({name: settings[name] for name in space} for settings in (own, defaults))
+    is_searched = all(value in space[name] for name, value in second.items())
+    return [first, second] if is_searched and second != first else [first]
+
+
+def with_settings(study: Study, settings: Mapping[str, Value]) -> Study:
+    """The study with changed settings; raises InvalidArgument for a value that a setting cannot have."""
+    changed: dict[str, Any] = dict(settings)
+    arm = replace(study.arms[0], mapping=changed.pop("mapping", study.arms[0].mapping))
+    fields_changed = {field: changed.pop(name) for name, field in _OF_SIMULATORS.items() if name in changed}
+    simulators = replace(study.simulators, **fields_changed)
+    return replace(study, arms=(arm,), simulators=simulators, algorithm={**study.algorithm, **changed})
 
 
 @record

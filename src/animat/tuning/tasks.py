@@ -5,27 +5,37 @@ from __future__ import annotations
 import hashlib
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, final
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
+from animat.compilation import jit_side_by_side
+from animat.environment import Environment
 from animat.errors import UnusableData
-from animat.evaluation.rollouts import roll_out
+from animat.evaluation.rollouts import Networks, roll_out
+from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import SimulatorTimeline, load_timeline, save_timeline
 from animat.progress import Progress
-from animat.studies.simulating import fit_simulators, one_condition, read_series
+from animat.studies.recording import fit_simulators, one_condition, read_series
 from animat.studies.specification import Study
 from animat.studies.task import StudyTask
 from animat.studies.training import training_of
-from animat.training.group import CHECKPOINT_S
+from animat.training.group import CHECKPOINT_S, Group, SideBySide
+from animat.training.sac import Learner, begin, train_chunk
 from animat.training.settings import SAC
-from animat.training.specification import CHUNKS
-from animat.tuning.side_by_side import Trials
-from animat.tuning.space import NUMBERS, Settings, with_settings
+from animat.training.specification import CHUNKS, Training
+from animat.tuning.specification import NUMBERS, Settings, with_settings
+from animat.wrappers import EpisodeLimit
 from animat.writing import write_whole
+
+Numbers = dict[str, Array]
 
 
 def timeline_file(study: Study) -> Path:
@@ -56,6 +66,61 @@ class Trial:
 
     number: int
     settings: Settings
+
+
+@lru_cache(maxsize=8)
+def programs(environment: Environment[Any], algorithm: SAC) -> tuple[Callable[..., Any], Callable[..., Any]]:
+    """`begin` and `train_chunk` for several policies, each with its own values of `NUMBERS` as the first argument.
+
+    The programs of ordinary training (`animat.training.group.programs`) have these settings compiled in.
+    """
+    limited = EpisodeLimit(environment)
+
+    def beginning(numbers: Numbers, key: Array) -> Learner:
+        learner = begin(limited, algorithm, key)
+        return learner._replace(trained=learner.trained._replace(log_alpha=jnp.log(numbers["initial_alpha"])))
+
+    def chunk(numbers: Numbers, learner: Learner, simulator: NeuronSimulator | None, first: Array, last: Array) -> Any:
+        # Traced numbers bypass the record's checks.
+        settings = object.__new__(SAC)
+        vars(settings).update({**vars(algorithm), **numbers})
+        return train_chunk(limited, settings, learner, simulator, first, last)
+
+    return jit_side_by_side(beginning), jit_side_by_side(chunk, (0, 0, None, None, None), donate_argnums=1)
+
+
+class Trials(SideBySide):
+    """The policies of several trials during training, one group per trial.
+
+    Args:
+        training: the training of all trials, except for the settings in `NUMBERS`.
+        timeline: the simulators they are trained on; None without neurons.
+        algorithms: settings of each trial, which differ only in `NUMBERS`.
+        members: numbers of each trial's policies, which decide their random numbers: all trials use the same ones.
+    """
+
+    def __init__(
+        self, training: Training, timeline: SimulatorTimeline | None, algorithms: Sequence[SAC], members: Sequence[int]
+    ) -> None:
+        # The default numbers stand in, so that trials with other numbers reuse the compiled program.
+        defaults = {name: getattr(SAC(), name) for name in NUMBERS}
+        training = replace(training, algorithm=replace(algorithms[0], **defaults))
+        numbers = {
+            name: jnp.repeat(jnp.array([getattr(settings, name) for settings in algorithms], jnp.float32), len(members))
+            for name in NUMBERS
+        }
+        compiled = programs(training.environment_on(timeline), training.algorithm)
+        groups = [Group(training, tuple(members), timeline, "", {})] * len(algorithms)
+        # Nobody reads their curves, and a diverging trial must not stop the others.
+        super().__init__(*groups, own_programs=[partial(program, numbers) for program in compiled], is_diagnosed=False)
+
+    def networks(self, trial: int, *, greedy: bool) -> Networks | None:
+        """The deployable policies of a trial; None if their parameters are not finite."""
+        network = jax.tree.map(lambda leaf: self.split(np.asarray(leaf))[trial], self._learners.deployed)
+        if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(network)):
+            return None
+        scales = jnp.tile(jnp.asarray(self._environment.scales, jnp.float32), (len(network[0].weight), 1))
+        return Networks(network, scales, greedy)
 
 
 @final

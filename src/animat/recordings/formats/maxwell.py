@@ -151,7 +151,8 @@ def _old(file: Hdf5File) -> _Layout:
 def _count_frames(layout: _Layout, ends: list[tuple[int, int, int]]) -> None:
     """State the first frame and how many there are, from those of each group: its first, its last and how many."""
     layout.first_frame = min(first for first, _, _ in ends)
-    layout.frames = max(last for _, last, _ in ends) - layout.first_frame + 1
+    frames = max(last for _, last, _ in ends) - layout.first_frame + 1
+    layout.frames = frames if frames > 0 else None
     lost = max(last - first + 1 - n for first, last, n in ends)
     if lost > 0:
         message = f"{lost:,} frames ({lost / layout.rate_hz:.3g} s) are missing from the recording"

@@ -219,7 +219,7 @@ def _onsets(file: Hdf5File, at: str, rate_hz: float) -> Column:
         return np.empty(0)
     least = largest / (100 if n_zeros > len(dataset) / 2 else 2)
     samples = np.concatenate([np.flatnonzero(magnitude(b) > least) + b for b in blocks])
-    return np.asarray(samples[np.diff(samples, prepend=-(2**62)) > APART_S * rate_hz])
+    return np.asarray(samples[np.diff(samples, prepend=-(2**62)) > max(1, APART_S * rate_hz)])
 
 
 def _from_zero(file: Hdf5File, at: str, data: Column) -> Column:

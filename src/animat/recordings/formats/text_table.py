@@ -152,10 +152,10 @@ def as_numbers(cells: Sequence[str]) -> Float64[np.ndarray, " cells"]:
 
 
 def whole_numbers(cell: str) -> list[int]:
-    """The whole numbers in a cell, separated by spaces; raises ValueError as `as_numbers` does."""
+    """The whole numbers in a cell, separated by spaces; raises ValueError for other text, OverflowError for 65 bits."""
     if "_" in cell:
         raise ValueError("expected whole numbers, got text")
-    return [int(word) for word in cell.split()]
+    return [np.int64(word).item() for word in cell.split()]
 
 
 def is_number(cell: str) -> bool:

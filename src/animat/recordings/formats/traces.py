@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -71,12 +70,32 @@ def _maxwell(file: Hdf5File, part: str | None, base: Recording) -> RawTraces:
     # Most groups are parts of another one; the one with the most channels has them all.
     group = max(groups, key=lambda group: file.dataset(f"{group}/raw").shape[0])
     labels = file.read(f"{group}/channels") if file.has(f"{group}/channels") else None
-    start_s = 0.0
-    if own := file.ends(f"{group}/frame_nos"):
-        earliest = min(ends[0] for g in groups if (ends := file.ends(f"{g}/frame_nos")))
-        start_s = (own[0] - earliest) / base.sampling_rate_hz
     scale = 1e6 * _number(file.first(f"{at}/settings/lsb"), OLD_LSB_V)
-    return _traces(file, f"{group}/raw", base, scale, channels_first=True, start_s=start_s, labels=labels)
+    traces = _traces(file, f"{group}/raw", base, scale, channels_first=True, labels=labels)
+    if own := file.ends(f"{group}/frame_nos"):
+        # The clock starts with the earliest of all groups, also of those without traces.
+        every = [file.ends(f"{at}/groups/{name}/frame_nos") for name in file.names(f"{at}/groups")]
+        traces = replace(traces, start_s=(own[0] - min(ends[0] for ends in every if ends)) / base.sampling_rate_hz)
+        if own[1] - own[0] + 1 != own[2]:
+            traces = _with_gaps(file, traces, file.read(f"{group}/frame_nos").astype(np.int64) - own[0])
+    return traces
+
+
+def _with_gaps(file: Hdf5File, traces: RawTraces, frame: Int64[np.ndarray, " samples"]) -> RawTraces:
+    """The traces with NaN for the frames that the rig lost; `frame` is the number of each sample, from 0 on."""
+    if len(frame) != traces.samples or np.any(np.diff(frame) <= 0) or frame[-1] > 100 * len(frame):
+        raise InvalidFile(
+            f"{file.path}: expected rising frame_nos for {traces.samples:,} samples, got {len(frame):,} up to "
+            f"{frame[-1]:,} that do not rise or belong to others: damaged; copy or record it again"
+        )
+
+    def read_uv(start: int, stop: int) -> Float32[np.ndarray, "samples channels"]:
+        first, last = np.searchsorted(frame, [start, stop]).tolist()
+        voltage_uv = np.full((len(traces.channels), stop - start), np.nan, np.float32).T
+        voltage_uv[frame[first:last] - start] = traces.read_uv(first, last)
+        return voltage_uv
+
+    return replace(traces, read_uv=read_uv, samples=int(frame[-1]) + 1)
 
 
 def _nwb(file: Hdf5File, part: str | None, base: Recording) -> RawTraces:
@@ -145,31 +164,18 @@ def _traces(
         used, nowhere = np.arange(columns), np.full(columns, np.nan)
         channels = Channels(used.astype(np.str_), np.full(columns, UNKNOWN), nowhere, nowhere)
     scale = uv_per_step[used] if isinstance(uv_per_step, np.ndarray) else uv_per_step
-    read_uv = partial(read_dataset_uv, path, where, used, channels_first, scale)
+
+    def read_uv(start: int, stop: int) -> Float32[np.ndarray, "samples channels"]:
+        with hdf5_file(path) as again:
+            dataset = again.dataset(where)
+            piece = np.asarray(dataset[:, start:stop].T if channels_first else dataset[start:stop])
+        if piece.shape[0] != stop - start:
+            raise InvalidFile(f"{path}: expected samples up to {stop:,} at /{where}, got {piece.shape[0]:,}")
+        if not np.array_equal(used, np.arange(columns)):
+            piece = piece[:, used]
+        return in_microvolts(piece, scale)
+
     return RawTraces(read_uv, channels, int(samples), base.sampling_rate_hz, start_s)
-
-
-def read_dataset_uv(
-    path: Path,
-    where: str,
-    columns: Int64[np.ndarray, " channels"],
-    channels_first: bool,
-    uv_per_step: Scale,
-    start: int,
-    stop: int,
-) -> Float32[np.ndarray, "samples channels"]:
-    """The voltage of samples `start` to `stop` in an HDF5 dataset, some columns of it in the order of the channels.
-
-    The dataset is (samples, channels), or the reverse if `channels_first`.
-    """
-    with hdf5_file(path) as file:
-        dataset = file.dataset(where)
-        piece = np.asarray(dataset[:, start:stop].T if channels_first else dataset[start:stop])
-    if piece.shape[0] != stop - start:
-        raise InvalidFile(f"{path}: expected samples up to {stop:,} at /{where}, got {piece.shape[0]:,}")
-    if not np.array_equal(columns, np.arange(piece.shape[1])):
-        piece = piece[:, columns]
-    return in_microvolts(piece, uv_per_step)
 
 
 def _number(value: Any, otherwise: float) -> float:

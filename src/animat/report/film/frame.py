@@ -1,18 +1,20 @@
-"""One frame of a film: the robot on the left; raster, response, command and return of the last seconds on the right."""
+"""Frames of a film: the robot on the left; raster, response, command and return of the last seconds on the right."""
 
 from __future__ import annotations
 
 import math
 from bisect import bisect_left
 from collections.abc import Callable, Sequence
-from functools import cache
+from functools import cache, lru_cache, partial
 
 import numpy as np
-from jaxtyping import UInt8
 from PIL import Image, ImageDraw, ImageFont
 
+from animat.closed_loop.runner import HostRunner
 from animat.report.film.scene import Moment, Scene
 from animat.report.style import BLUE, ORANGE, RED, condition_colours
+from animat.robots.drawing import Picture, draw_robot
+from animat.robots.host import HostRobot
 
 WIDTH_PX, HEIGHT_PX = 880, 440
 """Even, as video encoders require."""
@@ -21,6 +23,8 @@ SHOWN_S = 4.0
 ROBOT_PX = 360
 _PAPER, _INK, _FAINT, _LINE = "#fafaf8", "#343a40", "#868e96", "#dee2e6"
 _LEFT, _RIGHT = 478, WIDTH_PX - 14
+MOST_EARLIER = 500
+"""Observations from which a robot's trail is drawn."""
 COMMANDS = (ORANGE, BLUE, RED)
 """Colours of the commands, in their order."""
 
@@ -28,7 +32,7 @@ COMMANDS = (ORANGE, BLUE, RED)
 class Frames:
     """Draws a scene at any time; `picture` gives the robot at a moment, None if it cannot be drawn."""
 
-    def __init__(self, scene: Scene, picture: Callable[[int], UInt8[np.ndarray, "height width 3"] | None]) -> None:
+    def __init__(self, scene: Scene, picture: Callable[[int], Picture | None]) -> None:
         self._scene, self._picture = scene, picture
         self._times_s = np.array([moment.time_s for moment in scene.moments])
         self._colours = dict(zip(scene.conditions, condition_colours(["Hz"] * len(scene.conditions)), strict=True))
@@ -204,3 +208,50 @@ def _shortened(text: str, size: int) -> str:
 @cache
 def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
     return ImageFont.load_default(size)
+
+
+def pictures_of(scene: Scene) -> Callable[[int], Picture | None]:
+    """A function that draws the robot at each moment, called with rising numbers; it returns None without a picture."""
+    if not isinstance(scene.robot, HostRobot) and not hasattr(scene.robot, "draw"):
+        return lambda number: None
+    # Several frames in a row show the same moment.
+    return lru_cache(1)(_Replay(scene).picture if isinstance(scene.robot, HostRobot) else partial(_draw, scene))
+
+
+def _draw(scene: Scene, number: int) -> Picture | None:
+    now = scene.moments[number]
+    if not now.observation:
+        return None
+    before = [m for m in scene.moments[max(0, number - MOST_EARLIER) : number] if m.episode == now.episode]
+    return draw_robot(
+        scene.robot,
+        np.array(now.observation),
+        command=0.0 if now.command is None else np.array(now.command)[()],
+        earlier=[np.array(m.observation) for m in before if m.observation],
+    )
+
+
+class _Replay:
+    """A host robot moved by the same commands again; without a picture from where its observations differ."""
+
+    def __init__(self, scene: Scene) -> None:
+        self._moments, self._done = scene.moments, 0
+        self._runner = HostRunner(scene.robot, np.random.default_rng(scene.runner_seed), with_pictures=True)
+        self._episode: int | None = None
+        self._is_same = True
+
+    def picture(self, number: int) -> Picture | None:
+        for moment in self._moments[self._done : number + 1]:
+            self._move(moment)
+        self._done = number + 1
+        return self._runner.picture() if self._is_same else None
+
+    def _move(self, moment: Moment) -> None:
+        if moment.episode != self._episode:
+            self._episode = moment.episode
+            observation = self._runner.reset(moment.turn)
+        elif moment.command is None or not self._is_same:
+            return
+        else:
+            observation = self._runner.step(moment.command).observation
+        self._is_same = not moment.observation or np.array_equal(observation, moment.observation)

@@ -30,16 +30,10 @@ def is_session(path: Path) -> bool:
 
 
 def scene_of_session(path: str | os.PathLike[str], span_s: tuple[float, float] | None = None) -> Scene:
-    """The scene of a span of a session, from its log.
+    """The scene of a span of a session, from its log; by default a minute from just before the robot first moves.
 
-    Args:
-        path: of the session's folder or log.
-        span_s: on the session's clock; None: a minute from just before the robot first moves.
-
-    Raises:
-        InvalidFile: if there is no session, or its log cannot be read.
-        InvalidArgument: for a span in which nothing happened, or an unknown robot.
-        UnusableData: for a session without episodes.
+    Raises InvalidFile if there is no session, or its log cannot be read; InvalidArgument for a span in which nothing
+    happened, or an unknown robot; and UnusableData for a session without episodes.
     """
     session = read_session(path)
     file, fields = session.folder / LOG_FILE, session.log.header

@@ -15,8 +15,7 @@ from PIL import Image
 from animat.errors import InvalidArgument, InvalidFile
 from animat.extras import install_command
 from animat.progress import Progress, Silent
-from animat.report.film.frame import HEIGHT_PX, WIDTH_PX, Frames
-from animat.report.film.robot import pictures_of
+from animat.report.film.frame import HEIGHT_PX, WIDTH_PX, Frames, pictures_of
 from animat.report.film.scene import Scene
 from animat.robots.drawing import ACCENT, BODY, GOAL, GOAL_FILL, INK, RAIL, TRAIL
 from animat.writing import atomic_write
@@ -30,11 +29,7 @@ _ROBOTS = (ACCENT, BODY, GOAL, GOAL_FILL, INK, RAIL, TRAIL)
 
 
 def check_film(path: str | os.PathLike[str]) -> None:
-    """Check, before any work, that a film can be written.
-
-    Raises:
-        InvalidArgument: for another suffix, or if a package that MP4 needs is not installed.
-    """
+    """Raise InvalidArgument, before any work, for another suffix, or if a package that MP4 needs is not installed."""
     path = Path(path)
     if path.suffix.lower() not in FRAMES_PER_S:
         raise InvalidArgument(f"{path}: expected a film's name to end in .mp4 or .gif, got {path.suffix!r}")
@@ -48,11 +43,7 @@ def check_film(path: str | os.PathLike[str]) -> None:
 
 
 def write_film(scene: Scene, path: str | os.PathLike[str], progress: Progress | None = None) -> Path:
-    """Film a scene in real time, as .mp4 or .gif (`check_film`); the file is written atomically.
-
-    Raises:
-        InvalidFile: if it cannot be written.
-    """
+    """Film a scene in real time, as .mp4 or .gif (`check_film`), atomically; InvalidFile if it cannot be written."""
     path = Path(path)
     kind, frames = path.suffix.lower(), Frames(scene, pictures_of(scene))
     pictures = _pictures(scene, frames, FRAMES_PER_S[kind], progress or Silent())

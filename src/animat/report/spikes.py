@@ -1,4 +1,4 @@
-"""The raster: every spike as a dot, around the stimuli of a recording, or over all of it with its network bursts."""
+"""Figures of spikes: the raster, around stimuli or over all of a recording, and the post-stimulus time histogram."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from animat.errors import counted
+from animat.lazy import Axes, Figure
 from animat.recordings.recording import Recording
 from animat.report.style import (
     BLACK,
     BLUE,
+    GREY,
     RED,
     WINDOW,
-    Axes,
-    Figure,
     add_common_legend,
     add_legend,
     condition_colours,
@@ -23,6 +23,7 @@ from animat.report.style import (
     style_axes,
 )
 from animat.responses.bursts import NetworkBursts
+from animat.responses.psth import PostStimulusHistogram
 from animat.responses.responses import Responses
 from animat.responses.windows import HALF_NS_S, spikes_in
 from animat.tables import evenly
@@ -34,6 +35,8 @@ _MOST_DOTS = 3000
 _MOST_BINS = 100
 _MOST_SPIKES = 200_000
 _MOST_POINTS = 2_000
+_ARTEFACT_MS = 5.0
+"""Bins closer to the stimulus do not set the height of the histogram's axis if they would dwarf all others."""
 
 
 def draw_raster(recording: Recording, responses: Responses) -> Figure:
@@ -72,6 +75,41 @@ def draw_spontaneous(recording: Recording, bursts: NetworkBursts) -> Figure:
     lower.set_ylim(bottom=0)
     style_axes(lower, counted(len(bursts), "network burst"), "time (s)", "rate (Hz per channel)")
     add_legend(lower, loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0)
+    return figure
+
+
+def draw_psth(
+    histogram: PostStimulusHistogram, window_ms: tuple[float, float], spontaneous_hz: float | None = None
+) -> Figure:
+    """Mean rate per channel against the time from the stimulus; a stretch lost in the artefact is empty.
+
+    The response window is marked, and the spontaneous rate per channel is a line.
+    """
+    figure = new_figure(7.5, 3.8)
+    axes = figure.subplots()
+    rate_hz = np.nan_to_num(histogram.rate_hz)
+    label = f"window {window_ms[0]:g}-{window_ms[1]:g} ms"
+    axes.axvspan(*window_ms, color=WINDOW, alpha=0.25, linewidth=0, label=label)
+    axes.stairs(rate_hz, histogram.edges_ms, fill=True, color=BLUE)
+    axes.axvline(0, color=RED, linewidth=1, label="stimulus")
+    if spontaneous_hz is not None and np.isfinite(spontaneous_hz):
+        axes.axhline(spontaneous_hz, color=GREY, linewidth=1, linestyle="--", label="spontaneous rate")
+    axes.set_xlim(histogram.edges_ms[0], histogram.edges_ms[-1])
+    width_ms = histogram.edges_ms[1] - histogram.edges_ms[0]
+    of = f"{counted(histogram.n_stimuli, 'stimulus', 'stimuli')}, {counted(histogram.n_channels, 'channel')}"
+    title = f"{of}, bins of {width_ms:g} ms"
+    centres_ms = 0.5 * (histogram.edges_ms[1:] + histogram.edges_ms[:-1])
+    # Bins inside the response window always count, however close to the stimulus they are.
+    inside = (histogram.edges_ms[:-1] >= window_ms[0] - 1e-9) & (histogram.edges_ms[1:] <= window_ms[1] + 1e-9)
+    clear = (np.abs(centres_ms) > _ARTEFACT_MS) | inside
+    highest_hz = 1.1 * float(max(rate_hz[clear].max(initial=0.0), 2 * np.nan_to_num(spontaneous_hz or 0.0)))
+    if highest_hz and rate_hz.max() > 1.5 * highest_hz:
+        title += f"; the artefact, up to {rate_hz.max():.3g} Hz, is cut off"
+        axes.set_ylim(0, highest_hz)
+    else:
+        axes.set_ylim(0, None)
+    style_axes(axes, title, "time from stimulus (ms)", "firing rate (Hz per channel)")
+    add_legend(axes, loc="upper right")
     return figure
 
 
@@ -128,7 +166,9 @@ def _draw_stimuli(axes: Axes, recording: Recording, responses: Responses, from_m
         axes.scatter(lag_ms, row, s=2.5, c=[colours[drawn.index(i)] for i in condition[row]], linewidths=0)
         each = "each spike a dot"
     else:
-        _draw_rates(axes, row, lag_ms, len(chosen), len(recording.channels), from_ms, to_ms)
+        edges_ms = np.linspace(from_ms, to_ms, 1 + min(_MOST_BINS, round(to_ms - from_ms)))
+        count, *_ = np.histogram2d(row, lag_ms, bins=[np.arange(len(chosen) + 1) - 0.5, edges_ms - 1e3 * HALF_NS_S])
+        _draw_rates(axes, 1e3 * count / len(recording.channels) / (edges_ms[1] - edges_ms[0]), from_ms, to_ms)
         each = f"all {len(recording.channels):,} channels together"
     first = np.searchsorted(condition, drawn)
     middle = [(a + b - 1) / 2 for a, b in pairwise([*first, len(chosen)])]
@@ -144,26 +184,15 @@ def _draw_stimuli(axes: Axes, recording: Recording, responses: Responses, from_m
     style_axes(axes, title, "time from stimulus (ms)", "stimulus (row)")
 
 
-def _draw_rates(
-    axes: Axes,
-    row: Int64[np.ndarray, " spikes"],
-    lag_ms: Float64[np.ndarray, " spikes"],
-    rows: int,
-    channels: int,
-    from_ms: float,
-    to_ms: float,
-) -> None:
+def _draw_rates(axes: Axes, rate_hz: Float64[np.ndarray, "rows bins"], from_ms: float, to_ms: float) -> None:
     """The rate in each row and bin as a shade, as so many dots would merge."""
-    edges_ms = np.linspace(from_ms, to_ms, 1 + min(_MOST_BINS, round(to_ms - from_ms)))
-    count, *_ = np.histogram2d(row, lag_ms, bins=[np.arange(rows + 1) - 0.5, edges_ms - 1e3 * HALF_NS_S])
-    rate_hz = 1e3 * count / channels / (edges_ms[1] - edges_ms[0])
     # A burst in a row or two must not leave all others pale.
     drawn = axes.imshow(
         rate_hz,
         cmap="Greys",
         vmin=0,
         vmax=max(float(np.quantile(rate_hz, 0.95)), 1e-9),
-        extent=(from_ms, to_ms, -0.5, rows - 0.5),
+        extent=(from_ms, to_ms, -0.5, len(rate_hz) - 0.5),
         aspect="auto",
         origin="lower",
         interpolation="nearest",
