@@ -136,7 +136,8 @@ def _new(file: Hdf5File, part: str | None) -> _Layout:
 
 
 def _old(file: Hdf5File) -> _Layout:
-    layout = _Layout("proc0/spikeTimes", "bits", "mapping", USUAL_RATE_HZ)
+    version = {"layout": f"version {OLD_VERSION}"}
+    layout = _Layout("proc0/spikeTimes", "bits", "mapping", USUAL_RATE_HZ, provenance=version)
     sig = file.node("sig")
     if sig is not None and len(getattr(sig, "shape", ())) == 2 and sig.shape[0] > OLD_CHANNELS and sig.shape[1]:
         dataset = file.dataset("sig")
@@ -144,7 +145,6 @@ def _old(file: Hdf5File) -> _Layout:
         if not unavailable_filters(dataset):
             first, last = (int(high) << 16 | int(low) for low, high in (dataset[-2:, 0], dataset[-2:, n - 1]))
             _count_frames(layout, [(first, max(last, first + n - 1), n)])
-    layout.provenance["layout"] = f"version {OLD_VERSION}"
     return layout
 
 
