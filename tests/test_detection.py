@@ -26,7 +26,7 @@ from animat.recordings.recording import Channels
 from animat.stimulation.pulse import PUBLISHED_PULSE
 from animat.stimulation.stimulus import Stimulus
 from cultures import small_culture
-from rig_files import event_table, mapping_table, write_cl1, write_maxwell
+from rig_files import BITS, FIRST_FRAME, event_table, mapping_table, write_cl1, write_maxwell, write_old_maxwell
 
 RATE_HZ = 20_000.0
 SPIKE_UV = -60 * np.exp(-(((np.arange(-20, 41)) / 3.0) ** 2) / 2)
@@ -544,6 +544,22 @@ def test_after_frames_that_a_maxone_lost_spikes_are_where_they_were(tmp_path: Pa
             file["wells/well000/rec0000/groups/routed/frame_nos"][place] = number
         with pytest.raises(InvalidFile, match="expected rising frame_nos for 19,400 samples"):
             open_traces(path)
+
+
+def test_raw_traces_of_an_old_maxwell_file_with_lost_frames(tmp_path: Path) -> None:
+    voltage, truth = noisy(1, 0.4, step_uv=6.3)
+    sig = np.full((1028, len(voltage)), 512, "<u2")
+    sig[3] += voltage[:, 0].astype("<u2")
+    bits = np.array([(FIRST_FRAME + 12_100, 1)], BITS)
+    mapping = mapping_table([3], [1000])
+    path = write_old_maxwell(tmp_path / "a.h5", mapping=mapping, spikes=None, bits=bits, sig=sig, lost=8000)
+    recording = read_traces(path, Detection())
+    assert (recording.duration_s, recording.stimuli.time_s.tolist()) == (0.8, [0.605])
+    at = truth[0] + 8000 * (truth[0] >= 4000)
+    at = at[np.abs(at - 12_100) > 60]
+    found = DetectedSpikes(recording.spike_times_s, recording.spike_channels, np.empty(0), ())
+    assert agreement(found, [at])[1] <= 1
+    assert len(recording.spike_times_s) <= len(at) + 2
 
 
 def test_raw_traces_of_a_cl1_file(tmp_path: Path) -> None:

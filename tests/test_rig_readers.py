@@ -144,7 +144,7 @@ def test_maxwell_events_without_patterns_in_their_text_have_their_number(tmp_pat
         assert ("stimulus_pattern" in recording.provenance) == (words == "frequency 5")
         # The vendor's examples, and animat, count the events.
         events["eventid"] = [1, 2, 3]
-        counted = read_recording(write_maxwell(tmp_path / f"{words} counted.h5", **given))
+        counted = read_hdf5(write_maxwell(tmp_path / f"{words} counted.h5", **given))
         assert counted.stimuli.pattern.tolist() == (pattern if words == "pattern 1" else [UNKNOWN] * 3)
 
 
@@ -252,7 +252,7 @@ def test_old_maxwell_reads_bits_as_stimuli(tmp_path: Path) -> None:
     path = write_old_maxwell(tmp_path / "b.h5", mapping=TABLE, spikes=spike_table([0.11], [9]), bits=bits)
     assert read_recording(path).stimuli.pattern.tolist() == [UNKNOWN] * 2
     assert "frames-lost" not in found(recording)
-    some_lost = read_recording(write_old_maxwell(tmp_path / "b.h5", **given, lost=9900))
+    some_lost = read_hdf5(write_old_maxwell(tmp_path / "b.h5", **given, lost=9900))
     assert (some_lost.start_s, some_lost.stop_s) == (0.0, 0.5)
     assert found(some_lost)["frames-lost"].startswith("9,900 frames (0.495 s) are missing")
 
@@ -456,7 +456,7 @@ def test_other_nwb_lasts_as_long_as_its_units_were_observed(tmp_path: Path) -> N
             file["stimulus/presentation/pulses/start_time"][...] = [100.5, 110.0]
             file["units"].pop("obs_intervals", None)
             file["units/obs_intervals"] = observed
-        recording = read_recording(path)
+        recording = read_hdf5(path)
         assert (recording.start_s, recording.stop_s) == span_s
 
 
@@ -483,7 +483,7 @@ def test_other_nwb_stimuli_in_series(tmp_path: Path, name: str, times_s: list[fl
     if name == "events":
         with h5py.File(path, "r+") as file:
             file["stimulus/presentation/events"].attrs["neurodata_type"] = "IndexSeries"
-        assert read_recording(path).stimuli.time_s.tolist() == [0.1, 0.2, 0.3]
+        assert read_hdf5(path).stimuli.time_s.tolist() == [0.1, 0.2, 0.3]
 
 
 def test_every_entry_of_a_series_is_a_stimulus_if_its_data_are_not_one_number_each(tmp_path: Path) -> None:
@@ -541,7 +541,7 @@ def test_a_sampled_stimulus_begins_each_time_it_leaves_0(
         nwb_io.write(nwb)
     np.testing.assert_allclose(read_hdf5(path).stimuli.time_s, times_s)
     if of != "samples 2 ms apart":
-        np.testing.assert_allclose(read_recording(path, stimuli="timed").stimuli.time_s, 3.0 + np.array(times_s))
+        np.testing.assert_allclose(read_hdf5(path, stimuli="timed").stimuli.time_s, 3.0 + np.array(times_s))
     if of not in ("noise", "steps of a converter", "samples 2 ms apart"):
         np.testing.assert_allclose(read_recording(path, stimuli="each").stimuli.time_s, [0.3])
 

@@ -16,7 +16,6 @@ from animat.recordings.formats.stimulus_text import stimulus_columns
 from animat.recordings.recording import Recording
 from animat.tables import UNKNOWN
 
-OLD_VERSION = 20160704
 USUAL_RATE_HZ = 20_000.0
 ROOTS = ("wells", "recordings", "data_store")
 OLD_CHANNELS = 1024
@@ -136,7 +135,7 @@ def _new(file: Hdf5File, part: str | None) -> _Layout:
 
 
 def _old(file: Hdf5File) -> _Layout:
-    layout = _Layout("proc0/spikeTimes", "bits", "mapping", USUAL_RATE_HZ)
+    layout = _Layout("proc0/spikeTimes", "bits", "mapping", USUAL_RATE_HZ, provenance={"layout": "version 20160704"})
     sig = file.node("sig")
     if sig is not None and len(getattr(sig, "shape", ())) == 2 and sig.shape[0] > OLD_CHANNELS and sig.shape[1]:
         dataset = file.dataset("sig")
@@ -144,7 +143,6 @@ def _old(file: Hdf5File) -> _Layout:
         if not unavailable_filters(dataset):
             first, last = (int(high) << 16 | int(low) for low, high in (dataset[-2:, 0], dataset[-2:, n - 1]))
             _count_frames(layout, [(first, max(last, first + n - 1), n)])
-    layout.provenance["layout"] = f"version {OLD_VERSION}"
     return layout
 
 

@@ -101,16 +101,13 @@ def _of_intervals(file: Hdf5File, at: str, findings: list[Finding]) -> dict[str,
     # The index of a ragged column is part of it.
     used |= {f"{name}_index" for name in present}
     findings += left_out_findings("columns", [n for n in present if n not in used], f"/{at}", missing)
-    if "stimulus_frequency_hz" in columns:
-        frequency = columns["stimulus_frequency_hz"].astype(np.float64)
-        columns["stimulus_frequency_hz"] = np.where(frequency > 0, frequency, np.nan)
     return columns
 
 
 def _values(column: str, values: Column, time_s: Column) -> Column | None:
     """The values of a column with a known name, as another program means them; None if they cannot be what it says."""
     if column == "stimulus_frequency_hz":
-        return values if values.dtype.kind in "iuf" else None
+        return np.where(values > 0, values, np.nan) if values.dtype.kind in "iuf" else None
     is_whole = _are_whole(values)
     if column == "stimulus_pattern":
         # Conditions need not be numbered: fractions (a contrast), true and false are names.

@@ -23,8 +23,7 @@ LONGEST = 4096
 NAMES = {name: name for name in ("frequency_hz", "pattern", "presentation", "electrodes", "order", "pulses")}
 NAMES |= {"frequency": "frequency_hz", "freq": "frequency_hz", "electrode": "electrodes"}
 _MOST_ELECTRODES = 1024
-_VALUE = r"(-?[\d.]+(?:e[+-]?\d+)?(?:[,+]\d+)*)"
-_PAIR = re.compile(rf"([a-z_]+)\s*[=:\s]\s*{_VALUE}((?:[,;+\s]+\d+(?![.\w]))*)", re.IGNORECASE)
+_PAIR = re.compile(r"(?i)([a-z_]+)\s*[=:\s]\s*(-?[\d.]+(?:e[+-]?\d+)?(?:[,+]\d+)*)((?:[,;+\s]+\d+(?![.\w]))*)")
 """A name and its value; and whole numbers that follow, which belong to it if it is `electrodes`."""
 
 

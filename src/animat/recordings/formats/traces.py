@@ -61,7 +61,11 @@ def open_traces(
 def _maxwell(file: Hdf5File, part: str | None, base: Recording) -> RawTraces:
     if is_old(file):
         scale = 1e6 * _number(file.first("settings/lsb"), OLD_LSB_V)
-        return _traces(file, "sig", base, scale, channels_first=True, labels=np.arange(OLD_CHANNELS))
+        traces = _traces(file, "sig", base, scale, channels_first=True, labels=np.arange(OLD_CHANNELS))
+        if all(finding.name != "frames-lost" for finding in base.findings):
+            return traces
+        low, high = file.dataset("sig")[-2:].astype(np.int64)
+        return _with_gaps(file, traces, (high - high[0] << 16) + low - low[0])
     recordings = parts(file)
     at = recordings[choose(f"{file.path}: part", "--part", recordings, part)]
     groups = [f"{at}/groups/{g}" for g in file.names(f"{at}/groups") if file.has(f"{at}/groups/{g}/raw")]
