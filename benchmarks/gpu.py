@@ -75,7 +75,7 @@ def measured(recordings: str, policies: int) -> dict[str, Any]:
 
     from animat.neurons.timeline import fit_timeline
     from animat.recordings.reading import read_sources
-    from animat.responses.series import extract_series
+    from animat.responses.extraction import extract_series
     from animat.training.group import Group, SideBySide
     from animat.training.specification import Training
 

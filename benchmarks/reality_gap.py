@@ -156,7 +156,7 @@ def live_once(backend: str, channels: int, seed: int, robot: str, options: argpa
     from animat.cultures.series import record_series
     from animat.reality_gap import Calibration, run_policies
     from animat.recordings.reading import read_recording
-    from animat.responses.series import extract_series
+    from animat.responses.extraction import extract_series
     from animat.stimulation.protocol import CLOSED_LOOP
     from animat.training.policy import load_policies
 

@@ -21,9 +21,8 @@ from animat.closed_loop.tick import Tick
 from animat.coding.mapping import Thresholds
 from animat.cultures.observed import Observed, Spikes
 from animat.errors import InvalidArgument
-from animat.neurons.adjusted_rank import AdjustedRanks
 from animat.neurons.history import Memory, Ranked
-from animat.neurons.history_tracker import HistoryState
+from animat.neurons.history_tracker import AdjustedRanks, HistoryState
 from animat.neurons.memory import fit_memory
 from animat.neurons.simulator import fit_empirical
 from animat.responses.extraction import extract_responses

@@ -13,8 +13,7 @@ from scipy.integrate import solve_ivp
 
 from animat.environment import WithoutNeurons
 from animat.errors import InvalidArgument
-from animat.evaluation.heuristic import HeuristicPolicy
-from animat.evaluation.rollouts import Uniform, roll_out
+from animat.evaluation.rollouts import HeuristicPolicy, Uniform, roll_out
 from animat.robots import ArmState, TwoLinkArm
 from animat.robots.drawing import BODY, GOAL_FILL, draw_robot
 

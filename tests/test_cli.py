@@ -28,12 +28,12 @@ from animat.coding.mapping import Thresholds
 from animat.cultures.series import Series
 from animat.environment import Animat
 from animat.errors import InvalidArgument
+from animat.evaluation.optimal_returns import WellSampled
 from animat.evaluation.optimum import Optimum, best_return
-from animat.evaluation.resampling import WellSampled
 from animat.neurons.timeline import fit_timeline
 from animat.recordings.findings import Finding
 from animat.recordings.reading import read_recordings
-from animat.responses.series import extract_series
+from animat.responses.extraction import extract_series
 from animat.robots import Cartpole
 from animat.training.policy import Policy
 from animat.training.settings import SAC

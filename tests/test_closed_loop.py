@@ -44,9 +44,9 @@ from animat.cultures.contract import CultureContract
 from animat.cultures.observed import Observed
 from animat.environment import Animat
 from animat.errors import BudgetSpent, InvalidArgument, UnsafeStimulus, UnusableData
-from animat.evaluation.heuristic import HeuristicPolicy
+from animat.evaluation.rollouts import HeuristicPolicy
 from animat.evaluation.statistics import Interval
-from animat.neurons.adjusted_rank import AdjustedRanks
+from animat.neurons.history_tracker import AdjustedRanks
 from animat.neurons.simulator import fit_empirical
 from animat.recordings.reading import read_recording
 from animat.responses.condition import Condition

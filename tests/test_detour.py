@@ -12,8 +12,7 @@ import pytest
 
 from animat.environment import WithoutNeurons
 from animat.errors import InvalidArgument
-from animat.evaluation.heuristic import HeuristicPolicy
-from animat.evaluation.rollouts import Actor, Uniform, roll_out
+from animat.evaluation.rollouts import Actor, HeuristicPolicy, Uniform, roll_out
 from animat.robots import Detour, Wheels, WheelsState, robot_from_dict, robot_to_dict
 from animat.robots.surroundings import Surroundings
 

@@ -17,10 +17,9 @@ from scipy.stats import norm
 
 from animat.environment import Environment, WithoutNeurons
 from animat.robots import Cartpole, Navigation
-from animat.training.diagnosis import Diagnosis, diagnose
 from animat.training.networks import Network
 from animat.training.policy import CURVE, Policy
-from animat.training.sac import Learner
+from animat.training.sac import Diagnosis, Learner, diagnose
 from animat.training.specification import CHUNKS
 from test_sac_learning import SMALL as TINY
 from test_sac_learning import explored, start, trained_for

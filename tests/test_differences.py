@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from animat.differences import first_difference, with_fingerprint
+from animat.folders import first_difference, with_fingerprint
 
 plain = st.recursive(
     st.none() | st.integers() | st.text(max_size=5),

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from animat.cli import _parse
+from animat.goals.goal import read_goal
 from animat.goals.robot import FAILED, POTENTIAL, REACHED, with_goal
-from animat.goals.text import read_goal
 
 PAGE = (Path(__file__).parents[1] / "docs" / "goals.md").read_text()
 COMMANDS = [line.partition(" #")[0] for line in re.findall(r"^animat (.*)$", PAGE, re.MULTILINE)]

@@ -15,10 +15,9 @@ import pytest
 from animat.coding.mapping import Linear, Thresholds
 from animat.environment import Animat, WithoutNeurons
 from animat.errors import InvalidArgument, Mismatch
-from animat.evaluation.heuristic import HeuristicPolicy, heuristic_policy
+from animat.evaluation.optimal_returns import WellSampled
 from animat.evaluation.optimum import Optimum, best_return
-from animat.evaluation.resampling import WellSampled
-from animat.evaluation.rollouts import Constant, Uniform, networks_of, roll_out
+from animat.evaluation.rollouts import Constant, HeuristicPolicy, Uniform, heuristic_policy, networks_of, roll_out
 from animat.evaluation.table import evaluate
 from animat.neurons.simulator import fit_histogram, silenced
 from animat.neurons.synthetic import synthetic_simulator

@@ -28,7 +28,7 @@ from animat.report.film.session import scene_of_session
 from animat.report.film.simulated import scene_of_policies
 from animat.report.film.writing import FRAMES_PER_S
 from animat.responses.condition import Condition
-from animat.responses.series import extract_series
+from animat.responses.extraction import extract_series
 from animat.robots import Navigation
 from animat.training.policy import Policy, load_policies
 from fake_culture import CHANNELS, FakeCulture

@@ -10,7 +10,7 @@ from animat.cli import main
 from animat.closed_loop.session_data import LOG_FILE as SESSION
 from animat.cultures.series import SELECTION_FILE, STATE_FILE
 from animat.errors import Mismatch
-from animat.folder_kinds import MARKERS, Kind, expect_no_other
+from animat.folders import MARKERS, Kind, expect_no_other
 from animat.live.plan import LOG_FILE as LIVE
 from animat.recordings.formats.nwb import recording_name, write_nwb
 from animat.studies.cultures import MANIFEST as CULTURES

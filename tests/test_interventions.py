@@ -16,8 +16,7 @@ from animat.errors import InvalidArgument
 from animat.evaluation.commands import mean_commands
 from animat.evaluation.controls import interventions_of
 from animat.evaluation.interventions import run_interventions
-from animat.evaluation.rollouts import Actor, Networks, roll_out
-from animat.evaluation.traces import trace
+from animat.evaluation.rollouts import Actor, Networks, roll_out, trace
 from animat.neurons.simulator import indifferent
 from animat.neurons.synthetic import synthetic_simulator
 from animat.robots import Cartpole, Quantity, Robot, Wheels

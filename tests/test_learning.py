@@ -24,7 +24,7 @@ from animat.neurons.synthetic import synthetic_simulator
 from animat.neurons.timeline import SimulatorTimeline, fit_timeline
 from animat.recordings.reading import read_recordings
 from animat.responses.condition import Condition
-from animat.responses.series import extract_series
+from animat.responses.extraction import extract_series
 from animat.robots import Cartpole, Navigation
 from animat.stimulation.protocol import Presentation
 from animat.training.specification import Training

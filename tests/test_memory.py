@@ -23,15 +23,13 @@ from animat.coding.mapping import Linear, Thresholds
 from animat.environment import Animat, WithoutNeurons
 from animat.errors import InvalidArgument, InvalidFile, Mismatch, UnusableData
 from animat.evaluation.commands import CLASSES, commands_after
-from animat.evaluation.heuristic import heuristic_policy
 from animat.evaluation.optimum import best_return, best_returns
-from animat.evaluation.rollouts import Constant, Uniform, networks_of, roll_out
+from animat.evaluation.rollouts import Constant, Uniform, heuristic_policy, networks_of, roll_out
 from animat.execution.training import train
 from animat.neurons.fidelity import fidelity
-from animat.neurons.kinds import Kind
 from animat.neurons.memory import NO_MEMORY, Memory, MemorySimulator, _slopes, fit_memory
 from animat.neurons.simulator import EmpiricalSimulator, fit_empirical
-from animat.neurons.timeline import fit_timeline, load_timeline, save_timeline
+from animat.neurons.timeline import Kind, fit_timeline, load_timeline, save_timeline
 from animat.reality_gap import Calibration
 from animat.recordings.findings import Finding
 from animat.recordings.formats.nwb import write_nwb
@@ -39,8 +37,7 @@ from animat.recordings.recorded_culture import RecordedCulture
 from animat.responses.condition import Condition
 from animat.responses.conditions import conditions_named
 from animat.responses.extraction import extract_responses
-from animat.responses.quality.memory import memory_findings
-from animat.responses.quality.within_conditions import compare_passing
+from animat.responses.quality.history import compare_passing, memory_findings
 from animat.responses.responses import Responses, Trials
 from animat.robots.cartpole import Cartpole
 from animat.robots.navigation import Navigation

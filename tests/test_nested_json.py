@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from animat.differences import read_description
 from animat.errors import InvalidFile
 from animat.execution.receipts import Receipt, receipt_path
 from animat.execution.task import reported
+from animat.folders import read_description
 from animat.report.results import Results
 from animat.studies.results import read_arrays, read_typed
 from animat.tuning.search import JOURNAL, read_journal

@@ -12,8 +12,8 @@ from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.recording import Recording
 from animat.report.inspection import inspection_text
 from animat.report.spikes import draw_spontaneous
+from animat.responses.bursts import find_network_bursts
 from animat.responses.inspection import inspect_recording
-from animat.responses.network_bursts import find_network_bursts
 from test_responses import recording
 
 

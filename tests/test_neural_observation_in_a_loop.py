@@ -18,8 +18,8 @@ from animat.errors import InvalidArgument
 from animat.evaluation.rollouts import networks_of, roll_out
 from animat.neurons.history import Memory, Ranked
 from animat.neurons.history_tracker import HistoryState, HistoryTracker
-from animat.neurons.kinds import fit_simulator
 from animat.neurons.memory import fit_memory
+from animat.neurons.timeline import fit_simulator
 from animat.reality_gap import Calibration, run_policies
 from animat.reality_gap.predicting import EPISODES, roll_out_seed
 from animat.recordings.recording import Recording

@@ -16,7 +16,7 @@ from animat.closed_loop.session import read_session
 from animat.errors import InvalidFile, Mismatch
 from animat.goals.robot import robot_of
 from animat.recordings.reading import read_recordings
-from animat.responses.series import extract_series
+from animat.responses.extraction import extract_series
 from animat.stimulation.protocol import Protocol
 from animat.studies.run import plan_study, run_study
 from animat.studies.toml import read_study

@@ -20,9 +20,9 @@ from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.reading import read_recording
 from animat.recordings.recorded_culture import RecordedCulture, names_in
 from animat.recordings.recording import Channels, Recording
+from animat.responses.extraction import extract_series
 from animat.responses.quality.one_culture import series_findings
 from animat.responses.responses import Responses
-from animat.responses.series import extract_series
 from animat.training.policy import Policy
 from rig_files import mapping_table, spike_table, write_cl1, write_maxwell
 from synthetic_recordings import synthetic_recording

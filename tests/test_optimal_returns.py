@@ -18,9 +18,8 @@ from animat.cli import main
 from animat.coding.mapping import Thresholds
 from animat.environment import Animat
 from animat.errors import UnusableData
-from animat.evaluation.optimal_returns import optimal_returns
+from animat.evaluation.optimal_returns import WellSampled, _coarse, optimal_returns
 from animat.evaluation.optimum import Optimum, best_return, optimal_values
-from animat.evaluation.resampling import WellSampled, _coarse
 from animat.evaluation.rollouts import Constant, Uniform, roll_out
 from animat.neurons.simulator import fit_histogram
 from animat.neurons.timeline import fit_timeline

@@ -367,10 +367,10 @@ def test_nodes_of_a_grid_are_found_where_they_are(robot: Robot[Any]) -> None:
     grid = grid_for(robot)
     rows = jnp.asarray(np.random.default_rng(0).integers(0, grid.n_rows, 200))
     nodes = jnp.asarray(np.random.default_rng(1).integers(0, grid.along.stored, 200))
-    located = jax.vmap(grid.locate)(jax.vmap(grid.state_at)(rows, nodes))
-    np.testing.assert_allclose(located.node + located.place, nodes, atol=1e-3)
+    _, _, positions, node, place = jax.vmap(grid.locate)(jax.vmap(grid.state_at)(rows, nodes))
+    np.testing.assert_allclose(node + place, nodes, atol=1e-3)
     indices = np.stack(np.unravel_index(np.asarray(rows), [axis.stored for axis in grid.rows]), -1)
-    for axis, index, position in zip(grid.rows, indices.T, np.asarray(located.positions).T, strict=True):
+    for axis, index, position in zip(grid.rows, indices.T, np.asarray(positions).T, strict=True):
         if axis.periodic:
             index, position = (index - 1) % axis.nodes, (position - 1) % axis.nodes
         np.testing.assert_allclose(position, index, atol=1e-3)

@@ -15,7 +15,7 @@ from animat.coding.mapping import Thresholds
 from animat.cultures.budget import Account, Budget
 from animat.reality_gap.outlook import Outlook, outlook
 from animat.responses.condition import Condition
-from animat.responses.median_drift import MedianDrift, median_drift
+from animat.responses.quality.drift import MedianDrift, median_drift
 from animat.responses.responses import Responses
 from animat.robots import Navigation
 

@@ -22,7 +22,7 @@ from animat.coding.checking import check_mapping
 from animat.coding.mapping import Linear, Mapping, Thresholds
 from animat.environment import Animat
 from animat.errors import InvalidArgument, UnusableData
-from animat.evaluation.heuristic import HeuristicPolicy
+from animat.evaluation.rollouts import HeuristicPolicy
 from animat.execution.training import train
 from animat.robots import ROBOTS, Cartpole, Navigation, Quantity, Robot
 from animat.robots.checking import check_robot

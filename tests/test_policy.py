@@ -26,7 +26,7 @@ from animat.cli.responses import simulator_settings
 from animat.closed_loop.loop import Loop
 from animat.coding.mapping import mapping_named
 from animat.errors import InvalidArgument, InvalidFile, UnusableData
-from animat.neurons.kinds import Kind
+from animat.neurons.timeline import Kind
 from animat.responses.condition import Condition
 from animat.responses.conditions import conditions_named
 from animat.robots.cartpole import Cartpole

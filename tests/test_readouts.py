@@ -12,10 +12,9 @@ import pytest
 from animat.errors import InvalidArgument, InvalidFile, Mismatch
 from animat.recordings.recording import Channels, Recording
 from animat.recordings.response_table import ResponseTable
-from animat.responses.extraction import extract_responses
+from animat.responses.extraction import extract_responses, extract_series
 from animat.responses.quality.responses import _readouts
 from animat.responses.readouts import ALL, Readouts, count_readouts, read_readouts, readouts_on
-from animat.responses.series import extract_series
 from animat.responses.windows import read_windows
 from animat.tables import UNKNOWN
 from synthetic_recordings import SyntheticCulture

@@ -30,16 +30,14 @@ from animat.environment import Animat
 from animat.errors import InvalidArgument, Mismatch
 from animat.evaluation.controls import Control
 from animat.evaluation.coupling import Coupling
-from animat.evaluation.heuristic import HeuristicPolicy, heuristic_policy
 from animat.evaluation.optimum import best_return
-from animat.evaluation.rollouts import Uniform, networks_of, roll_out
+from animat.evaluation.rollouts import HeuristicPolicy, Uniform, heuristic_policy, networks_of, roll_out
+from animat.evaluation.statistics import EpisodeComparison
 from animat.evaluation.table import evaluate
-from animat.evaluation.verdict import EpisodeComparison
 from animat.neurons.history_tracker import HistoryState
-from animat.neurons.kinds import Kind
 from animat.neurons.simulator import NeuronSimulator, fit_empirical, pooled_percentiles, silenced
 from animat.neurons.synthetic import LABELS, MEANS_HZ
-from animat.neurons.timeline import fit_timeline
+from animat.neurons.timeline import Kind, fit_timeline
 from animat.reality_gap import Calibration, RealityGap, Row, check_policies, run_policies
 from animat.reality_gap.interventions import intervention_table
 from animat.reality_gap.predicting import EPISODES, ROLL_OUTS, roll_out_seed

@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 from scipy.stats import binom, norm
 
-from animat.neurons.adjusted_rank import AdjustedRanks
 from animat.neurons.history import NO_MEMORY, ranks_among
-from animat.neurons.history_tracker import HistoryTracker
+from animat.neurons.history_tracker import AdjustedRanks, HistoryTracker
 from animat.reality_gap.predicting import Prediction
 from animat.reality_gap.reasons import CHECKS, LEVEL, Evidence, reasons
 from animat.reality_gap.session_responses import CommandSums, SessionResponses

@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from animat.neurons.adjusted_rank import AdjustedRanks
+from animat.neurons.history_tracker import AdjustedRanks
 from animat.neurons.memory import fit_memory
-from animat.responses.quality.repetition import repetition_findings, repetitions
+from animat.responses.quality.history import repetition_findings, repetitions
 from animat.responses.responses import Responses, Trials
 from test_simulator import responses_of
 

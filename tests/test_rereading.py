@@ -9,8 +9,8 @@ import pytest
 from scipy.stats import norm, percentileofscore, spearmanr
 
 from animat.coding.mapping import Linear
-from animat.neurons.adjusted_rank import AdjustedRanks
 from animat.neurons.history import Memory, Ranked
+from animat.neurons.history_tracker import AdjustedRanks
 from animat.neurons.memory import MemorySimulator, fit_memory
 from animat.neurons.simulator import fit_empirical
 from animat.reality_gap import Calibration

@@ -25,7 +25,7 @@ from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.reading import read_recording, read_recordings
 from animat.responses.condition import Condition
 from animat.responses.conditions import ByElectrode, conditions_named
-from animat.responses.series import extract_series
+from animat.responses.extraction import extract_series
 from animat.robots import Navigation
 from animat.stimulation.protocol import Presentation, Protocol
 from animat.stimulation.pulse import BALANCED_PULSE, PUBLISHED_PULSE, Phase, Pulse

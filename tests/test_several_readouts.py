@@ -18,10 +18,9 @@ from animat.errors import InvalidArgument, Mismatch
 from animat.evaluation.commands import mean_commands
 from animat.evaluation.controls import interventions_of
 from animat.neurons.fidelity import fidelity
-from animat.neurons.kinds import fit_simulator
 from animat.neurons.memory import Memory, fit_memory
 from animat.neurons.simulator import NeuronSimulator, fit_histogram, silenced
-from animat.neurons.timeline import fit_timeline
+from animat.neurons.timeline import fit_simulator, fit_timeline
 from animat.responses.readouts import Readouts
 from animat.responses.responses import Responses
 from animat.robots import Cartpole
@@ -149,7 +148,7 @@ def test_timelines_stack_them_and_refuse_others() -> None:
         assert timeline.readouts == HALVES
         here, there = timeline.at(10.0), fit_simulator(series[1], kind=kind)
         np.testing.assert_array_equal(drawn(here, 100), drawn(there, 100))
-        held = timeline.with_first_percentiles().at(10.0)
+        held = timeline.with_percentiles("first").at(10.0)
         np.testing.assert_array_equal(held.percentiles, timeline.at(0.0).percentiles)
     other = replace(series[1], readouts=replace(HALVES, names=("a", "b")))
     with pytest.raises(Mismatch, match="readouts: expected the same in all recordings, got left, right at 0 min and a"):

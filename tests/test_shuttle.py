@@ -12,10 +12,9 @@ from scipy.integrate import solve_ivp
 
 from animat.environment import WithoutNeurons
 from animat.errors import InvalidArgument
-from animat.evaluation.heuristic import HeuristicPolicy, heuristic_policy
 from animat.evaluation.information import goal_information
 from animat.evaluation.optimum import best_return
-from animat.evaluation.rollouts import Constant, Uniform, roll_out
+from animat.evaluation.rollouts import Constant, HeuristicPolicy, Uniform, heuristic_policy, roll_out
 from animat.robots import Shuttle, ShuttleState
 from animat.robots.drawing import BODY, GOAL_FILL, draw_robot
 from animat.robots.grid import grid_for

@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.stats import mannwhitneyu
@@ -32,7 +33,7 @@ from animat.cultures.kinds import recorded_culture
 from animat.cultures.virtual import VirtualCulture
 from animat.environment import Animat
 from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch, UnusableData
-from animat.evaluation.heuristic import heuristic_policy
+from animat.evaluation.rollouts import heuristic_policy
 from animat.execution.jobs import in_order
 from animat.execution.receipts import Receipt, digest_of
 from animat.execution.task import carry_out
@@ -42,7 +43,7 @@ from animat.progress import Progress, Silent
 from animat.recordings.formats.nwb import recording_name, write_nwb
 from animat.recordings.reading import read_recording, read_recordings
 from animat.report.html import cell, with_error
-from animat.responses.series import extract_series
+from animat.responses.extraction import extract_series
 from animat.robots import Cartpole, Navigation
 from animat.stimulation.protocol import Protocol, read_protocol
 from animat.stimulation.selection import SelectionRule
@@ -1111,4 +1112,4 @@ def test_the_heuristic_policy_goes_where_it_should(mapping: str) -> None:
             seen[1, 1] = 0.95  # below the goal
         actor = jax.tree.map(lambda leaf: leaf[0], rule)
         # The synthetic means rise with the frequency.
-        assert actor.act(environment, seen, np.zeros((2, 1))).tolist() == [4, 0]
+        assert actor.act(environment, jnp.asarray(seen), jnp.zeros((2, 1))).tolist() == [4, 0]

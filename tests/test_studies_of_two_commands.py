@@ -16,14 +16,14 @@ from animat.execution.training import train
 from animat.neurons.timeline import fit_timeline, load_timeline
 from animat.progress import Silent
 from animat.recordings.reading import read_recordings
-from animat.responses.series import extract_series
+from animat.responses.extraction import extract_series
 from animat.robots import Wheels
 from animat.stimulation.protocol import TWO_COMMANDS
 from animat.studies.recording import Fit, Record, controllability
 from animat.studies.run import run_study
 from animat.studies.source import Source
 from animat.studies.specification import Arm, Compared, RobotSpec, Simulators, Study
-from animat.studies.task import draw_seed
+from animat.studies.task import study_seed
 from animat.studies.toml import read_study, study_to_toml
 from animat.studies.training import TrainGroup
 from animat.training.lessons import Lesson
@@ -72,7 +72,7 @@ def test_a_study_s_policies_are_those_of_the_same_training_by_hand(tmp_path: Pat
         mapping=mapping_named("1-threshold"),
         policies=2,
         iterations=3000,
-        seed=draw_seed("training", 1, "wheels", "drawn"),
+        seed=study_seed(STUDY, "training", "wheels", "drawn"),
         shadowing="drawn",
         duration_min=60,
         algorithm=SAC(**SMALL),

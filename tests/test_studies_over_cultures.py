@@ -40,6 +40,7 @@ from animat.studies.source import Source, read_seeds
 from animat.studies.specification import Study
 from animat.studies.tabulating import NONE, SECOND, TOO_FEW, outcome_of
 from animat.studies.toml import read_study, study_to_toml
+from animat.studies.training import training_of
 from animat.writing import exclusive_lock
 from synthetic_recordings import write_synthetic_series
 
@@ -88,6 +89,18 @@ def test_a_seed_of_too_many_digits_is_refused_as_such() -> None:
 def test_a_culture_is_one_or_many_and_not_both(given: dict[str, Any], message: str) -> None:
     with pytest.raises(InvalidArgument, match=message):
         Source(**given)
+
+
+def test_policies_on_two_cultures_are_independent(tmp_path: Path) -> None:
+    study = replace(read_study(TINY), culture=Source(seeds="1-40"))
+    files = replace(study, culture=Source(kind="files", folders=("day-1", "day-2")))
+    every = [each for one in (study, files) for each in studies_of(one).values()]
+    spec, arms = study.robots[0], [arm for arm in study.arms if arm.trained]
+    assert len({training_of(each, spec, arm).seed for each in every for arm in arms}) == 42 * len(arms)
+    # A study that was moved together with its recordings is the same.
+    elsewhere, here = (Source(kind="files", files=(f"{folder}day-1",)) for folder in ("/there/", ""))
+    seeds = {training_of(replace(study, culture=each), spec, arms[0]).seed for each in (elsewhere, here)}
+    assert seeds == {training_of(every[40], spec, arms[0]).seed}
 
 
 def test_each_culture_has_the_study_that_it_would_have_alone(tmp_path: Path) -> None:

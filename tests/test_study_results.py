@@ -25,7 +25,7 @@ from animat.neurons.timeline import SimulatorTimeline, fit_timeline
 from animat.progress import Silent
 from animat.recordings.reading import read_recordings
 from animat.report.results import ComparedReturns, Results, Score, StudyOptimum
-from animat.responses.series import extract_series
+from animat.responses.extraction import extract_series
 from animat.robots import Navigation
 from animat.studies.episodes import COLUMNS, RANDOM, Paths, episode_rows, mean_returns, read_episodes, write_episodes
 from animat.studies.evaluating import Evaluate
@@ -38,7 +38,7 @@ from animat.studies.results import read_typed, write_typed
 from animat.studies.source import Source
 from animat.studies.specification import Arm, Compared, RobotSpec, Study, mapping_label
 from animat.studies.tabulating import References, Tabulate, _controls, _finite, _optimum_error, _scores
-from animat.studies.task import draw_seed
+from animat.studies.task import study_seed
 from animat.studies.training import TrainGroup
 from animat.training.policy import Policy, load_policies
 from animat.wrappers import ShuffledDelivery
@@ -252,7 +252,7 @@ def test_policies_are_evaluated_as_they_are_trained_on_the_minute_s_own_neurons(
     environment, turned = (shuffled, chosen) if delivery == "shuffled" else (chosen, shuffled)
     expected = {}
     for at_min in (0.0, 140.0):
-        seed = draw_seed(study.seed, "navigation", "control", at_min)
+        seed = study_seed(study, "navigation", "control", at_min)
         for name, answering in (("own", at_min), ("other", 140.0 - at_min)):
             ran = roll_out(environment, timeline.at(answering), networks, episodes=7, seed=seed)
             expected[name, at_min] = ran.returns
@@ -299,7 +299,7 @@ def test_conditions_of_few_responses_are_left_out_of_a_study_s_optima_and_named(
     # As many as the fewest at 0 min has, and one more: at 140 min all have as many.
     enough = min(n[0]) + 1
     assert min(n[1]) >= enough > min(n[0])
-    monkeypatch.setattr("animat.evaluation.resampling.FEW_SAMPLES", enough)
+    monkeypatch.setattr("animat.evaluation.optimal_returns.FEW_SAMPLES", enough)
     few = [i for i in range(5) if n[0][i] < enough]
     at_first, at_last, without = optima_of(recorded)
     assert at_first.left_out == "; ".join(f"{series[0].conditions[i].label} ({n[0][i]})" for i in few)
@@ -364,7 +364,7 @@ def test_lines_of_learning_curves_are_of_the_simulator_in_use(tmp_path: Path) ->
 def test_where_no_condition_has_enough_responses_a_study_has_no_optimum(
     recorded: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("animat.evaluation.resampling.FEW_SAMPLES", 41)
+    monkeypatch.setattr("animat.evaluation.optimal_returns.FEW_SAMPLES", 41)
     at_first, at_last, without = optima_of(recorded)
     for row in (at_first, at_last):
         assert row.left_out.count(" Hz (") == 5

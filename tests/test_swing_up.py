@@ -14,9 +14,8 @@ from scipy.integrate import solve_ivp
 
 from animat.environment import WithoutNeurons
 from animat.errors import InvalidArgument
-from animat.evaluation.heuristic import HeuristicPolicy, heuristic_policy
 from animat.evaluation.optimum import best_return
-from animat.evaluation.rollouts import Uniform, roll_out
+from animat.evaluation.rollouts import HeuristicPolicy, Uniform, heuristic_policy, roll_out
 from animat.robots import SwingUp, SwingUpState
 from animat.robots.drawing import ACCENT, BODY, draw_robot
 from animat.robots.grid import Grid, grid_for

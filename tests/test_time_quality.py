@@ -18,7 +18,7 @@ from animat.recordings.quality import recording_findings
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
 from animat.recordings.time_quality import frequency_findings
-from animat.responses.series import extract_series
+from animat.responses.extraction import extract_series
 from animat.stimulation.protocol import Order, Protocol
 from synthetic_recordings import synthetic_recording
 from test_inspection import answering

@@ -27,19 +27,18 @@ from animat.closed_loop.session import read_session
 from animat.coding.mapping import Thresholds
 from animat.environment import Animat, WithoutNeurons
 from animat.errors import InvalidArgument, InvalidFile, Mismatch
-from animat.evaluation.heuristic import HeuristicPolicy
+from animat.evaluation.rollouts import HeuristicPolicy
 from animat.evaluation.table import evaluate
 from animat.execution.training import train
-from animat.neurons.adjusted_rank import AdjustedRanks
+from animat.neurons.history_tracker import AdjustedRanks
 from animat.neurons.simulator import fit_empirical
 from animat.neurons.timeline import SimulatorTimeline, fit_timeline
 from animat.reality_gap import Calibration, run_policies
 from animat.reality_gap.session_responses import read_responses
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.recording import Recording
-from animat.responses.extraction import extract_responses
+from animat.responses.extraction import extract_responses, extract_series
 from animat.responses.readouts import ALL, Readouts
-from animat.responses.series import extract_series
 from animat.robots import Cartpole, Robot
 from animat.robots.checking import check_robot
 from animat.robots.registry import REGISTRY

@@ -23,11 +23,10 @@ from scipy import stats
 from animat.cli import main
 from animat.cultures.virtual import VirtualCulture
 from animat.errors import InvalidArgument, UnusableData
-from animat.neurons.free_runs import LAGS, autocorrelation, free_runs, run_lengths, shares_lasting
 from animat.neurons.history import NO_MEMORY, Memory, Ranked
-from animat.neurons.kinds import fit_simulator
 from animat.neurons.memory import MemorySimulator, fit_memory
-from animat.neurons.prediction import halved, predict
+from animat.neurons.prediction import LAGS, autocorrelation, free_runs, halved, predict, run_lengths, shares_lasting
+from animat.neurons.timeline import fit_simulator
 from animat.neurons.validation import MARGINAL, Validation, correlations, validate
 from animat.recordings.reading import read_recording
 from animat.report.validation import draw_validation, validation_text

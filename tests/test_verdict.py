@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import norm
 
-from animat.evaluation.verdict import EpisodeComparison, Verdict, compare_episodes
+from animat.evaluation.statistics import EpisodeComparison, Verdict, compare_episodes
 
 returns = st.lists(st.integers(-5, 5).map(float), min_size=1, max_size=12)
 

@@ -22,8 +22,8 @@ from animat.closed_loop.session import read_session
 from animat.closed_loop.session_data import LOG_FILE
 from animat.closed_loop.tick import STOP_FILE
 from animat.errors import InvalidArgument, InvalidFile
-from animat.watch.agents import by_agent
 from animat.watch.session import SessionView, _in_force, stop_session
+from animat.watch.sums import by_agent
 from animat.watch.tail import Tail
 from watching import session_in
 

@@ -144,7 +144,7 @@ def test_a_path_outside_of_the_folder_is_refused(app: Any, folder: Path, place: 
     assert [each.place for each in find(folder / "in")] == ["session"]
 
 
-@pytest.mark.parametrize("path", ["../app.py", "%2e%2e/app.py", "page/index.html", "session.log", "guard.py"])
+@pytest.mark.parametrize("path", ["../app.py", "%2e%2e/app.py", "page/index.html", "session.log", "serving.py"])
 def test_no_other_file_is_served(app: Any, path: str) -> None:
     assert asked(app, path).status == 404
 

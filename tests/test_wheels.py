@@ -13,8 +13,7 @@ import pytest
 
 from animat.environment import WithoutNeurons
 from animat.errors import InvalidArgument
-from animat.evaluation.heuristic import HeuristicPolicy
-from animat.evaluation.rollouts import Uniform, roll_out
+from animat.evaluation.rollouts import HeuristicPolicy, Uniform, roll_out
 from animat.robots import Wheels, WheelsState, robot_from_dict, robot_to_dict
 from animat.robots.drawing import ACCENT, BODY, GOAL_FILL, INK, draw_robot
 from animat.robots.surroundings import Surroundings, places_within_reach

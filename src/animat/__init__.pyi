@@ -28,7 +28,7 @@ from animat.responses.conditions import conditions_named as conditions_named
 from animat.responses.readouts import Readouts as Readouts
 from animat.responses.responses import Responses as Responses
 from animat.responses.extraction import extract_responses as extract_responses
-from animat.responses.series import extract_series as extract_series
+from animat.responses.extraction import extract_series as extract_series
 from animat.responses.inspection import Inspection as Inspection, inspect_recording as inspect_recording
 from animat.neurons.simulator import (
     NeuronSimulator as NeuronSimulator,

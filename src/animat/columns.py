@@ -6,10 +6,7 @@ from collections.abc import Sequence
 
 
 def align_columns(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """Indented lines of a table: the first and last column, which are text, aligned left, the others right.
-
-    A column without a heading has an empty one.
-    """
+    """Indented lines of a table: the first and last column, which are text, aligned left, the others right."""
     widths = [max(map(len, column)) for column in zip(head, *rows, strict=True)]
     lines = []
     for first, *numbers, last in (head, *rows):

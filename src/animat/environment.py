@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 from dataclasses import dataclass
-from typing import Any, Generic, NamedTuple, TypeVar, final
+from typing import Any, Generic, NamedTuple, TypeAlias, TypeVar, final
 
 import jax
 import jax.numpy as jnp
@@ -22,8 +22,8 @@ from animat.robots.base import Quantity, Robot
 RobotState = TypeVar("RobotState")
 
 Uniforms = Float[Array, " noise"]
-Number = Float[Array, ""]
-Flag = Bool[Array, ""]
+Neurons: TypeAlias = NeuronSimulator | None
+"""The simulator of the neurons that move a robot; None without neurons."""
 
 _NOT_CARRIED = ("delivered", "rate_hz", "command")
 """Entries of `info` about the last iteration, which the next one does not need."""
@@ -32,8 +32,8 @@ _NOT_CARRIED = ("delivered", "rate_hz", "command")
 class Ended(NamedTuple):
     """Whether the task ended by itself (fell, reached), or the episode was cut off (`animat.wrappers.EpisodeLimit`)."""
 
-    terminated: Flag
-    truncated: Flag
+    terminated: Bool[Array, ""]
+    truncated: Bool[Array, ""]
 
 
 class Responded(NamedTuple):
@@ -60,7 +60,7 @@ class State(NamedTuple):
     robot: Any
     iteration: Int[Array, ""]
     neurons: Float[Array, "2"]
-    reward: Number
+    reward: Float[Array, ""]
     ended: Ended
     info: dict[str, Array]
 
@@ -113,17 +113,16 @@ class Environment(abc.ABC, Generic[RobotState]):
         )
 
     @abc.abstractmethod
-    def respond(self, uniforms: Uniforms, state: State, action: Array, simulator: NeuronSimulator | None) -> Responded:
+    def respond(self, uniforms: Uniforms, state: State, action: Array, simulator: Neurons) -> Responded:
         """The result of an action before the robot moves; arguments as in `advance`."""
 
-    def advance(self, uniforms: Uniforms, state: State, action: Array, simulator: NeuronSimulator | None) -> State:
+    def advance(self, uniforms: Uniforms, state: State, action: Array, simulator: Neurons) -> State:
         """One iteration, with its random numbers as an argument: training draws them for many iterations at once.
 
         Args:
             uniforms: random numbers in [0, 1), shape (noise_size,).
             state: before the iteration; `State.carried` is enough.
             action: an index, or the commands.
-            simulator: of the neurons; None without neurons.
         """
         delivered, answer, command = self.respond(uniforms, state, action, simulator)
         robot, reward, terminated = self.robot.advance(uniforms[: self.robot.noise_size], state.robot, command)
@@ -131,7 +130,7 @@ class Environment(abc.ABC, Generic[RobotState]):
         return State(robot, state.iteration + 1, answer.history, reward, Ended(terminated, jnp.bool_(False)), info)
 
     @final
-    def step(self, key: PRNGKeyArray, state: State, action: Array, simulator: NeuronSimulator | None) -> State:
+    def step(self, key: PRNGKeyArray, state: State, action: Array, simulator: Neurons) -> State:
         """One iteration: action, response, command, movement."""
         return self.advance(jax.random.uniform(key, (self.noise_size,)), state, action, simulator)
 
@@ -149,9 +148,6 @@ class Environment(abc.ABC, Generic[RobotState]):
 @dataclass(frozen=True)
 class Animat(Environment[RobotState]):
     """A robot moved by the responses of neurons to the conditions that the agent picks.
-
-    Attributes:
-        mapping: from the response of a readout to a motor command.
 
     Raises:
         InvalidArgument: for anything but a robot and a mapping, such as their names.
@@ -176,7 +172,7 @@ class Animat(Environment[RobotState]):
         # neurons get the same random numbers.
         return self.robot.noise_size + 2
 
-    def respond(self, uniforms: Uniforms, state: State, action: Array, simulator: NeuronSimulator | None) -> Responded:
+    def respond(self, uniforms: Uniforms, state: State, action: Array, simulator: Neurons) -> Responded:
         if simulator is None:
             raise InvalidArgument("simulator: expected a neuron simulator, which an Animat needs, got None")
         expect_fit(self.robot.name, self.robot.n_commands, simulator.n_readouts)
@@ -212,7 +208,7 @@ class WithoutNeurons(Environment[RobotState]):
     def noise_size(self) -> int:
         return self.robot.noise_size
 
-    def respond(self, uniforms: Uniforms, state: State, action: Array, simulator: NeuronSimulator | None) -> Responded:
+    def respond(self, uniforms: Uniforms, state: State, action: Array, simulator: Neurons) -> Responded:
         no_answer = Answer(jnp.float32(jnp.nan), state.neurons)
         command = action if self.commands is None else jnp.asarray(self.commands, jnp.float32)[action]
         return Responded(action, no_answer, jnp.clip(command, -1.0, 1.0))

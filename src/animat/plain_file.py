@@ -11,11 +11,7 @@ from animat.errors import InvalidFile, as_invalid_file
 
 
 def expect_plain_file(path: str | os.PathLike[str], most_bytes: int | None = None) -> Path:
-    """Refuse anything that cannot be read to its end: a folder, a device, a pipe, a missing or too large file.
-
-    Raises:
-        InvalidFile: naming the file and what it is.
-    """
+    """Refuse what cannot be read to its end: a folder, a device, a pipe, a missing or too large file (InvalidFile)."""
     if not os.fspath(path):
         raise InvalidFile("expected the name of a file, got an empty name")
     path = Path(path)

@@ -21,8 +21,7 @@ _LARGEST_MIB = 800
 class Process:
     """A process that executes calls, with the same import path as this one.
 
-    Args:
-        where: the core it is pinned to; `gpu`: not pinned, and may use the GPU; `plain`: neither, and silent.
+    It is pinned to the core `where`; with `gpu` not pinned, and may use the GPU; with `plain` neither, and silent.
     """
 
     def __init__(self, where: int | Literal["gpu", "plain"]) -> None:

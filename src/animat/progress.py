@@ -182,9 +182,8 @@ class Bar:
 
         training: 34 %, 81,600 of 240,000 iterations, 1,940 a second, 82 s left, return 101.2
 
-    While nothing moves, the line comes every minute.
-
-    It is a context manager. Each phase of the work (`in_phase`) has its own bar.
+    While nothing moves, the line comes every minute. It is a context manager. Each phase of the work (`in_phase`) has
+    its own bar.
     """
 
     def __init__(self, title: str) -> None:

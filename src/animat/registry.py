@@ -23,7 +23,6 @@ _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,40}")
 _PLACE = re.compile(r"[\w.]{1,200}:[\w.<>]{1,200}")
 _IN_MEMORY = "train in memory: train(training, timeline, None)"
 
-
 _registries: dict[type, Registry[Any]] = {}
 """By base class."""
 

@@ -34,10 +34,7 @@ def freeze(table: object, name: str, **dtypes: Any) -> None:
 
 
 def read_only(table: object, attribute: str, dtype: Any = None) -> np.ndarray[Any, Any]:
-    """Turn an attribute of a frozen dataclass into a read-only array; returns it.
-
-    Raises UnusableData if the type is of whole numbers and some are not, which would be truncated silently.
-    """
+    """Turn an attribute of a frozen dataclass into a read-only array, and return it; refuse to truncate numbers."""
     value = getattr(table, attribute)
     try:
         given = np.asarray(value)

@@ -11,9 +11,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from animat.environment import Animat, Environment, Responded, RobotState, State, Uniforms
+from animat.environment import Animat, Environment, Neurons, Responded, RobotState, State, Uniforms
 from animat.errors import InvalidArgument
-from animat.neurons.simulator import NeuronSimulator
 from animat.robots.base import Quantity, Robot, capability
 from animat.robots.host import HostRobot
 
@@ -49,10 +48,10 @@ class Wrapper(Environment[RobotState]):
     def reset(self, key: PRNGKeyArray) -> State:
         return self.inside.reset(key)
 
-    def respond(self, uniforms: Uniforms, state: State, action: Array, simulator: NeuronSimulator | None) -> Responded:
+    def respond(self, uniforms: Uniforms, state: State, action: Array, simulator: Neurons) -> Responded:
         return self.inside.respond(uniforms, state, action, simulator)
 
-    def advance(self, uniforms: Uniforms, state: State, action: Array, simulator: NeuronSimulator | None) -> State:
+    def advance(self, uniforms: Uniforms, state: State, action: Array, simulator: Neurons) -> State:
         return self.inside.advance(uniforms, state, action, simulator)
 
 
@@ -68,7 +67,7 @@ def unwrapped(environment: Environment[RobotState], to: type[Wrapper[Any]] | tup
 class EpisodeLimit(Wrapper[RobotState]):
     """Truncates an episode at the robot's `episode_limit`, unless the task ends by itself."""
 
-    def advance(self, uniforms: Uniforms, state: State, action: Array, simulator: NeuronSimulator | None) -> State:
+    def advance(self, uniforms: Uniforms, state: State, action: Array, simulator: Neurons) -> State:
         after = self.inside.advance(uniforms, state, action, simulator)
         truncated = (after.iteration >= self.robot.episode_limit) & ~after.ended.terminated
         return after._replace(ended=after.ended._replace(truncated=truncated))
@@ -92,10 +91,10 @@ class ShuffledDelivery(NeuralWrapper[RobotState]):
         InvalidArgument: around an environment without neurons.
     """
 
-    def respond(self, uniforms: Uniforms, state: State, action: Array, simulator: NeuronSimulator | None) -> Responded:
+    def respond(self, uniforms: Uniforms, state: State, action: Array, simulator: Neurons) -> Responded:
         return self.inside.respond(uniforms, state, self._drawn(uniforms), simulator)
 
-    def advance(self, uniforms: Uniforms, state: State, action: Array, simulator: NeuronSimulator | None) -> State:
+    def advance(self, uniforms: Uniforms, state: State, action: Array, simulator: Neurons) -> State:
         return self.inside.advance(uniforms, state, self._drawn(uniforms), simulator)
 
     def _drawn(self, uniforms: Uniforms) -> Array:
@@ -130,11 +129,7 @@ class NeuralObservation(NeuralWrapper[RobotState]):
 class TrialCosts(NeuralWrapper[RobotState]):
     """Adds up the cost of an episode's trials in `State.info["cost"]`; rewards are unchanged (see `net_reward`).
 
-    Attributes:
-        costs: of a trial of each condition, in the units of the reward.
-
-    Raises:
-        InvalidArgument: unless there is one cost per condition.
+    `costs` are those of a trial of each condition, in the units of the reward.
     """
 
     costs: tuple[float, ...]
@@ -147,7 +142,7 @@ class TrialCosts(NeuralWrapper[RobotState]):
     def reset(self, key: PRNGKeyArray) -> State:
         return _remembering(self.inside.reset(key), {_COST: jnp.float32(0.0)})
 
-    def advance(self, uniforms: Uniforms, state: State, action: Array, simulator: NeuronSimulator | None) -> State:
+    def advance(self, uniforms: Uniforms, state: State, action: Array, simulator: Neurons) -> State:
         after = self.inside.advance(uniforms, state, action, simulator)
         return add_cost(after, self.of(after.info["delivered"]))
 
@@ -177,10 +172,7 @@ class YokedDelivery(NeuralWrapper[RobotState]):
     """Delivers the stimuli chosen for another episode, which runs in parallel: as many, but unrelated to this one.
 
     The agent observes and acts in the other episode, with its own neurons; when it ends it starts again. The same
-    stimuli are delivered here, whatever happens here.
-
-    Raises:
-        InvalidArgument: with a robot that is stepped outside JAX.
+    stimuli are delivered here, whatever happens here. Refuses a robot that is stepped outside JAX.
 
     Source: the non-contingent control of Bakkum et al. 2008, doi:10.1088/1741-2560/5/3/004.
     """
@@ -201,7 +193,7 @@ class YokedDelivery(NeuralWrapper[RobotState]):
         state, other = self.inside.reset(key), self.inside.reset(jax.random.fold_in(key, 1)).carried
         return _remembering(state, {_OTHER: other, _START: other})
 
-    def advance(self, uniforms: Uniforms, state: State, action: Array, simulator: NeuronSimulator | None) -> State:
+    def advance(self, uniforms: Uniforms, state: State, action: Array, simulator: Neurons) -> State:
         n, other = self.inside.noise_size, state.info[_OTHER]
         other_after = self.inside.advance(uniforms[n:], other, action, simulator)  # type: ignore[arg-type]
         next_ = _where(jnp.logical_or(*other_after.ended), state.info[_START], other_after.carried)
@@ -211,14 +203,7 @@ class YokedDelivery(NeuralWrapper[RobotState]):
 @final
 @dataclass(frozen=True)
 class GoalSwitch(Wrapper[RobotState]):
-    """Gives the robot another goal in mid-episode, that of the first other start whose goal looks different.
-
-    Attributes:
-        at: the number of iterations before the switch.
-
-    Raises:
-        InvalidArgument: for a robot whose goal cannot be switched (`Robot.with_goal_of`).
-    """
+    """Gives the robot another goal after `at` iterations, that of the first other start whose goal looks different."""
 
     at: int
 
@@ -229,7 +214,7 @@ class GoalSwitch(Wrapper[RobotState]):
         state = self.inside.reset(key)
         return _remembering(state, {_GOAL: other_goal(self.robot, state.robot, jax.random.fold_in(key, 1))})
 
-    def advance(self, uniforms: Uniforms, state: State, action: Array, simulator: NeuronSimulator | None) -> State:
+    def advance(self, uniforms: Uniforms, state: State, action: Array, simulator: Neurons) -> State:
         after = self.inside.advance(uniforms, state, action, simulator)
         switched = capability(self.robot, "with_goal_of")(after.robot, after.info[_GOAL])
         return after._replace(robot=_where(after.iteration == self.at, switched, after.robot))
@@ -240,7 +225,7 @@ class GoalSwitch(Wrapper[RobotState]):
 class ReversedMapping(Animat[RobotState]):
     """Reverses the mapping: every response moves the robot by the opposite command."""
 
-    def respond(self, uniforms: Uniforms, state: State, action: Array, simulator: NeuronSimulator | None) -> Responded:
+    def respond(self, uniforms: Uniforms, state: State, action: Array, simulator: Neurons) -> Responded:
         responded = super().respond(uniforms, state, action, simulator)
         return responded._replace(command=-responded.command)
 
@@ -252,7 +237,7 @@ class IdealActuator(Animat[RobotState]):
 
     commands: tuple[float | tuple[float, ...], ...]
 
-    def respond(self, uniforms: Uniforms, state: State, action: Array, simulator: NeuronSimulator | None) -> Responded:
+    def respond(self, uniforms: Uniforms, state: State, action: Array, simulator: Neurons) -> Responded:
         responded = super().respond(uniforms, state, action, simulator)
         return responded._replace(command=jnp.asarray(self.commands, jnp.float32)[action])
 

@@ -26,10 +26,7 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield a temporary path next to `path`; on success rename it to `path`, on any error remove it.
 
     An existing file at `path` stays intact until the new one is complete and on disk, even if the disk fills up or the
-    process is killed. Missing parent folders are created.
-
-    Raises:
-        InvalidFile: if the file cannot be written.
+    process is killed. Missing parent folders are created. Raises InvalidFile if the file cannot be written.
     """
     path = Path(path)
     with as_invalid_file(path, "cannot be written"):

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from animat.cli.command import FolderCommand
 from animat.errors import InvalidArgument, Mismatch, counted, in_min, some_of
-from animat.folder_kinds import expect_no_other
+from animat.folders import expect_no_other
 
 if TYPE_CHECKING:
     from animat.stimulation.protocol import Protocol

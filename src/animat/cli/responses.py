@@ -57,8 +57,8 @@ class SimulatorOptions(ResponseOptions):
         from animat.neurons.timeline import fit_timeline
         from animat.recordings.reading import read_sources
         from animat.responses.conditions import conditions_named
+        from animat.responses.extraction import extract_series
         from animat.responses.readouts import ALL
-        from animat.responses.series import extract_series
 
         fitted = {} if trained is None else trained.fitted
         fit = simulator_settings(fitted, self.simulator, self.bins, self.range_hz)

@@ -162,7 +162,7 @@ class Run(StimulationOptions):
     def _calibration(self, recordings: Sequence[Recording], first: Policy, fit: dict[str, Any]) -> Calibration:
         """The calibration by the recordings' responses, read by the options and otherwise as in the training."""
         from animat.reality_gap import Calibration, check_conditions
-        from animat.responses.series import extract_series
+        from animat.responses.extraction import extract_series
 
         trained = first.fitted.get("burst_threshold")
         series = extract_series(

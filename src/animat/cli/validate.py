@@ -41,8 +41,8 @@ class Validate(ResponseOptions):
         from animat.report.style import save_figure
         from animat.report.validation import correlations_text, draw_validation, validation_text
         from animat.responses.conditions import conditions_named
+        from animat.responses.extraction import extract_series
         from animat.responses.readouts import read_readouts
-        from animat.responses.series import extract_series
 
         expect_at_least("--seed", self.seed, 0)
         by = None if self.conditions is None else conditions_named(self.conditions)

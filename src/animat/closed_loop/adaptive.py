@@ -7,9 +7,8 @@ from jaxtyping import Float32, Float64
 from scipy.special import ndtr, ndtri
 
 from animat.coding.mapping import N_PERCENTILES
-from animat.neurons.adjusted_rank import AdjustedRanks
 from animat.neurons.history import ranks_among
-from animat.neurons.history_tracker import HistoryState
+from animat.neurons.history_tracker import AdjustedRanks, HistoryState
 
 NEWEST = 100
 """Responses kept of a condition, as many as in the paper's recording; with more, thresholds would adapt late."""

@@ -16,8 +16,7 @@ from animat.coding.mapping import N_PERCENTILES, Mapping, mapping_to_data
 from animat.errors import InvalidArgument, UnusableData, expect_at_least
 from animat.evaluation.transfer import describe_window, other_presentation
 from animat.goals.robot import body_and_goal
-from animat.neurons.adjusted_rank import AdjustedRanks
-from animat.neurons.history_tracker import HistoryTracker
+from animat.neurons.history_tracker import AdjustedRanks, HistoryTracker
 from animat.recordings.findings import Finding
 from animat.responses.condition import Condition
 from animat.responses.readouts import ALL, Readouts

@@ -17,7 +17,7 @@ from animat.closed_loop.outline import Episode, Outline, count_electrode_pulses
 from animat.closed_loop.session_data import LOG_FILE, RECORDING_FILE, TICKS_FILE, SessionData, expect_session_log
 from animat.closed_loop.tick import STOP_FILE, Ending, Tick, TickTable
 from animat.errors import InvalidArgument, InvalidFile, Mismatch
-from animat.folder_kinds import expect_no_other
+from animat.folders import expect_no_other
 from animat.plain_file import is_absent, is_folder
 from animat.progress import Progress
 from animat.recordings.formats.nwb import write_nwb

@@ -16,8 +16,8 @@ from animat.cultures.base import Culture
 from animat.cultures.same_culture import other_patterns
 from animat.cultures.under_way import PartialRecording
 from animat.cultures.virtual import VirtualCulture
-from animat.differences import first_difference
 from animat.errors import InvalidArgument, Mismatch, expect_at_least, shown
+from animat.folders import first_difference
 from animat.progress import Part, Progress, Silent
 from animat.recordings.formats.nwb import recording_name, write_nwb
 from animat.recordings.reading import read_recording

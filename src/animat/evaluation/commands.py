@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Float64, Int
 
 from animat.coding.decoder import decode
 from animat.coding.mapping import Thresholds
-from animat.environment import Animat, Environment
+from animat.environment import Animat, Environment, Neurons
 from animat.errors import InvalidArgument
 from animat.neurons.memory import MemorySimulator
 from animat.neurons.simulator import NeuronSimulator, Stored, to_jax
@@ -73,15 +73,12 @@ class Commands:
         return np.asarray(np.einsum("al,alk->ak", self.probabilities, basis))
 
 
-def commands_of(environment: Environment[Any], simulator: NeuronSimulator | None) -> Commands:
+def commands_of(environment: Environment[Any], simulator: Neurons) -> Commands:
     """The commands that each action of an environment leads to.
 
     For thresholds the probabilities are exact: where a condition's distribution passes each threshold is found by
     bisection, to the last bit of a float32. For a continuous mapping 2048 responses of equal probability represent a
-    condition; 21 evenly spaced commands represent a continuous action.
-
-    Raises:
-        InvalidArgument: for an Animat without a simulator.
+    condition; 21 evenly spaced commands represent a continuous action. An Animat needs a simulator (InvalidArgument).
     """
     animat = unwrapped(environment)
     if not isinstance(animat, Animat):
@@ -109,12 +106,9 @@ def commands_of(environment: Environment[Any], simulator: NeuronSimulator | None
 
 
 def mean_commands(
-    environment: Environment[Any], simulator: NeuronSimulator | None
+    environment: Environment[Any], simulator: Neurons
 ) -> tuple[np.ndarray, Float64[np.ndarray, "actions *commands"]]:
-    """The environment's input for each action, and the mean command that it leads to; errors as in `commands_of`.
-
-    Several commands are averaged over 2048 responses of equal probability.
-    """
+    """The environment's input for each action, and the mean command that it leads to; errors as in `commands_of`."""
     animat = unwrapped(environment)
     if isinstance(animat, Animat) and simulator is not None and animat.robot.n_commands > 1:
         commands = decode(animat.mapping, simulator.evenly_drawn(_QUANTILES), jnp.asarray(simulator.percentiles))
@@ -123,7 +117,7 @@ def mean_commands(
     return of_one.actions, np.sum(of_one.levels * of_one.probabilities, axis=1)
 
 
-def memory_of(environment: Environment[Any], simulator: NeuronSimulator | None) -> MemorySimulator | None:
+def memory_of(environment: Environment[Any], simulator: Neurons) -> MemorySimulator | None:
     """The simulator, whose history is distinguished by class; None without memory; refuses a custom memory."""
     if not isinstance(unwrapped(environment), Animat) or simulator is None or not simulator.has_memory:
         return None
@@ -144,7 +138,7 @@ def class_of(simulator: MemorySimulator, history: Float[Stored, "*histories 2"])
     return np.asarray(np.sum(np.asarray(history)[..., :1] >= np.asarray(jnp.quantile(traces, ends)), axis=-1))
 
 
-def commands_after(environment: Environment[Any], simulator: NeuronSimulator | None) -> list[list[Commands]]:
+def commands_after(environment: Environment[Any], simulator: Neurons) -> list[list[Commands]]:
     """For each class of the history, for each class of the next history: the commands that each action leads to.
 
     Their probabilities are joint with the next class and add up to 1 over both. Memory is approximated by six classes

@@ -1,4 +1,4 @@
-"""Controls and interventions that test whether the culture contributes to policies' returns, for simulator and loop."""
+"""Controls and interventions that test whether the culture contributes to policies' returns, and their results."""
 
 from __future__ import annotations
 
@@ -8,12 +8,13 @@ from typing import Any, Literal
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float64
 
-from animat.environment import Animat, Environment
+from animat.environment import Animat, Environment, Neurons
 from animat.evaluation.commands import mean_commands
 from animat.evaluation.coupling import best_coupling
-from animat.evaluation.heuristic import heuristic_policy
-from animat.evaluation.rollouts import Actor, Constant, Episodes, Networks, Uniform, roll_out
+from animat.evaluation.rollouts import Actor, Constant, Episodes, Networks, Uniform, heuristic_policy, roll_out
+from animat.evaluation.statistics import standard_error
 from animat.neurons.simulator import NeuronSimulator, indifferent, silenced
 from animat.robots.host import HostRobot
 from animat.wrappers import (
@@ -36,7 +37,6 @@ class Control:
 
     Attributes:
         name: `random`, `constant 5 Hz`, `heuristic`, `silent` or `shuffled`, or the name of an intervention.
-        meaning: a short description.
         actor: one actor, or the policies side by side.
         delivery: `"chosen"`: neurons get what was chosen; `"shuffled"`: a condition drawn at random in each iteration;
             `"silent"`: nothing; `"yoked"`: the stimuli of another episode.
@@ -55,9 +55,7 @@ class Control:
     switch_at: int | None = None
     commands: tuple[Any, ...] | None = None
 
-    def within(
-        self, environment: Environment[Any], simulator: NeuronSimulator | None
-    ) -> tuple[Environment[Any], NeuronSimulator | None]:
+    def within(self, environment: Environment[Any], simulator: Neurons) -> tuple[Environment[Any], Neurons]:
         """The policies' environment and simulator, changed for this control; the same objects if nothing changes."""
         if self.is_turned_round or self.commands is not None:
             animat = unwrapped(environment)
@@ -77,9 +75,7 @@ class Control:
             environment = GoalSwitch(environment, self.switch_at)
         return environment, simulator
 
-    def run(
-        self, environment: Environment[Any], simulator: NeuronSimulator | None, *, episodes: int, seed: int
-    ) -> Episodes:
+    def run(self, environment: Environment[Any], simulator: Neurons, *, episodes: int, seed: int) -> Episodes:
         """Its episodes in the policies' environment and simulator, changed for it; errors as in `roll_out`."""
         return roll_out(*self.within(environment, simulator), self.actor, episodes=episodes, seed=seed)
 
@@ -88,10 +84,7 @@ RANDOM = Control("random", "any action, equally likely", Uniform())
 
 
 def controls_of(
-    environment: Environment[Any],
-    simulator: NeuronSimulator | None,
-    labels: Sequence[str],
-    policies: Networks | None = None,
+    environment: Environment[Any], simulator: Neurons, labels: Sequence[str], policies: Networks | None = None
 ) -> list[Control]:
     """The controls of an environment.
 
@@ -113,18 +106,14 @@ def controls_of(
     return controls
 
 
-def coupling_of(environment: Environment[Any], simulator: NeuronSimulator | None, *, seed: int) -> Control:
+def coupling_of(environment: Environment[Any], simulator: Neurons, *, seed: int) -> Control:
     """The best coupling as a control; arguments and errors as in `best_coupling`, whose search takes seconds."""
     reflex = best_coupling(environment, simulator, seed=seed)
     return Control("coupling", "the best reflex: no memory, no goal", reflex)
 
 
 def interventions_of(
-    environment: Environment[Any],
-    simulator: NeuronSimulator,
-    policies: Networks,
-    *,
-    switch_at: int | None = None,
+    environment: Environment[Any], simulator: NeuronSimulator, policies: Networks, *, switch_at: int | None = None
 ) -> list[Control]:
     """The same policies with one change each, to find out what the culture contributes.
 
@@ -165,3 +154,52 @@ def _without_influence(policies: Networks) -> list[Control]:
         Control("silent", silent, policies, "silent"),
         Control("shuffled", "the delivered condition is drawn at random", policies, "shuffled"),
     ]
+
+
+@dataclass(frozen=True, eq=False)
+class Row:
+    """A row of the table: `policies` or a control, with its returns.
+
+    Attributes:
+        changed: whether its environment differs from that of the policies: another culture, or another delivery.
+        electrode_pulses: mean number per episode, for each actor; None if the conditions' electrodes are not known.
+        pulse_cost: of one electrode pulse, in the units of the return.
+    """
+
+    name: str
+    meaning: str
+    episodes: Episodes
+    changed: bool = False
+    electrode_pulses: Float64[np.ndarray, " actors"] | None = None
+    pulse_cost: float = 0.0
+
+    @property
+    def mean_returns(self) -> Float64[np.ndarray, " actors"]:
+        """Each actor's mean return over its episodes, which the paper calls a policy's performance."""
+        return self.episodes.returns.mean(axis=1)  # type: ignore[no-any-return]
+
+    def to_dict(self) -> dict[str, Any]:
+        """The row as plain data; the net return is the mean return less the cost of pulses, if these are known."""
+        means = self.mean_returns
+        pulses = None if self.electrode_pulses is None else float(self.electrode_pulses.mean())
+        # The samples are the actors; a control has one actor, whose episodes are the samples.
+        samples = means if len(means) > 1 else self.episodes.returns[0]
+        return {
+            "name": self.name,
+            "meaning": self.meaning,
+            "actors": len(means),
+            "episodes": self.episodes.returns.shape[1],
+            "mean_return": float(means.mean()),
+            "standard_error": standard_error(samples) if len(samples) > 1 else None,
+            "mean_length": float(self.episodes.lengths.mean()),
+            "terminated_share": float(self.episodes.terminated.mean()),
+            "mean_returns": means.tolist(),
+            "electrode_pulses": pulses,
+            "net_return": None if pulses is None else float(means.mean()) - self.pulse_cost * pulses,
+            **self.met,
+        }
+
+    @property
+    def met(self) -> dict[str, Any]:
+        """How the goal was met (`animat.goals.tally.Outcome.means`); empty for a robot without one."""
+        return {} if self.episodes.outcome is None else self.episodes.outcome.means()

@@ -14,15 +14,12 @@ from jaxtyping import Array, Float, Float64, Int
 from scipy.optimize import differential_evolution
 from scipy.stats import t as student_t
 
-from animat.environment import Environment
+from animat.environment import Environment, Neurons
 from animat.errors import InvalidArgument
 from animat.evaluation.commands import mean_commands
-from animat.evaluation.heuristic import heuristic_policy
 from animat.evaluation.optimum import Optimum
-from animat.evaluation.rollouts import Actor, Seen, Uniforms, nearest_action, roll_out
+from animat.evaluation.rollouts import Actor, Seen, Uniforms, heuristic_policy, nearest_action, roll_out, trace
 from animat.evaluation.statistics import CONFIDENCE, Interval, standard_error
-from animat.evaluation.traces import trace
-from animat.neurons.simulator import NeuronSimulator
 from animat.progress import Progress
 from animat.robots.base import capability
 from animat.robots.host import HostRobot
@@ -58,7 +55,6 @@ class Coupling(Actor):
         weights: W, with b as its last column.
         actions: the environment's input for each action; None where any command can be given.
         means: the mean command of each action.
-        kind: which of the two above.
         seen: indices of the observation that it sees.
     """
 
@@ -76,25 +72,14 @@ class Coupling(Actor):
 
 
 def best_coupling(
-    environment: Environment[Any],
-    simulator: NeuronSimulator | None,
-    *,
-    seed: int = 1,
-    progress: Progress | None = None,
+    environment: Environment[Any], simulator: Neurons, *, seed: int = 1, progress: Progress | None = None
 ) -> Coupling:
     """The best coupling for an environment and the neurons in it, as one actor for `roll_out`.
 
     Differential evolution, twice for each kind, over weights from -12 to 12: once from random weights only, and once
     also with couplings closest to the robot's heuristic, if it has one. All couplings of a search have the same starts
-    and random numbers. The best of the last generations is chosen in fresh episodes.
-
-    Args:
-        simulator: None without neurons.
-        seed: decides every random draw.
-        progress: what to report to.
-
-    Raises:
-        InvalidArgument: for a robot that is stepped outside JAX: the search takes thousands of episodes.
+    and random numbers. The best of the last generations is chosen in fresh episodes. Refuses a robot that is stepped
+    outside JAX (InvalidArgument).
 
     Source: Storn & Price 1997, doi:10.1023/A:1008202821328.
     """
@@ -156,7 +141,7 @@ def best_coupling(
 
 
 def _near_heuristic(
-    environment: Environment[Any], simulator: NeuronSimulator | None, seen: tuple[int, ...], seed: int
+    environment: Environment[Any], simulator: Neurons, seen: tuple[int, ...], seed: int
 ) -> Float64[np.ndarray, "starts weights"]:
     """The coupling closest to the robot's heuristic, by least squares over its episodes, and steeper ones, if any."""
     robot = environment.robot
@@ -183,7 +168,6 @@ class ContextGap:
 
     Attributes:
         coupling: mean return of the best coupling.
-        standard_error: of `coupling`.
         gap: with its interval for the episodes and the optimum's grid. None if the optimum is not above random
             stimuli, or with one episode.
         best_known: mean return of the best known agent, which replaces the optimum; None if the optimum is known.

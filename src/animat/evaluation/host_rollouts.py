@@ -12,13 +12,11 @@ import numpy as np
 from jaxtyping import Array, Float, Key, PRNGKeyArray
 
 from animat.compilation import COMPILER_OPTIONS
-from animat.environment import Environment, State
-from animat.neurons.simulator import NeuronSimulator
+from animat.environment import Environment, Neurons, State
 from animat.robots.host import Bodies, HostRobot, StepResult
 
 AT_ONCE = 64
 """Bodies side by side: each may take megabytes, and more would not make a step cheaper."""
-
 _LAST = threading.local()
 """The bodies of a thread's last wave: creating new ones takes longer than many an episode."""
 
@@ -36,7 +34,7 @@ class Counts(NamedTuple):
 def roll_out_on_host(
     environment: Environment[Any],
     episodes: int,
-    simulator: NeuronSimulator | None,
+    simulator: Neurons,
     actors: Any,
     keys: Key[Array, " actors"],
     seed: int,
@@ -68,17 +66,9 @@ def roll_out_on_host(
 
 
 def paths_on_host(
-    environment: Environment[Any],
-    simulator: NeuronSimulator | None,
-    actors: Any,
-    keys: Key[Array, " actors"],
-    seed: int,
+    environment: Environment[Any], simulator: Neurons, actors: Any, keys: Key[Array, " actors"], seed: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """One episode of each actor with its path; arguments as in `roll_out_on_host`.
-
-    Returns:
-        Observations before each iteration and after the last, commands, lengths, as in `animat.studies.episodes.Paths`.
-    """
+    """One episode of each actor: observations, commands and lengths, as in `animat.studies.episodes.Paths`."""
     robot, n = environment.robot, len(keys)
     assert isinstance(robot, HostRobot)
     observations = np.zeros((n, robot.episode_limit + 1, len(robot.observation_spec)), np.float32)
@@ -99,7 +89,7 @@ def paths_on_host(
 
 def _wave(
     environment: Environment[Any],
-    simulator: NeuronSimulator | None,
+    simulator: Neurons,
     actors: Any,
     keys: Key[Array, " actors"],
     seeds: Sequence[tuple[int, ...]],
@@ -128,16 +118,9 @@ def _wave(
 
 
 def _iterations(
-    environment: Environment[Any],
-    simulator: NeuronSimulator | None,
-    actors: Any,
-    keys: Key[Array, " actors"],
-    bodies: Bodies,
+    environment: Environment[Any], simulator: Neurons, actors: Any, keys: Key[Array, " actors"], bodies: Bodies
 ) -> Iterator[tuple[np.ndarray, np.ndarray, StepResult]]:
-    """The commands, delivered conditions and results of each iteration of bodies that have begun, for the same actors.
-
-    Ended episodes begin again: a body must not be stepped after its end.
-    """
+    """Commands, delivered conditions and results of each iteration of begun bodies; ended episodes begin again."""
     shape = len(keys), len(bodies) // len(keys)
     state = _started(environment, keys, shape[1])
     for iteration in range(environment.robot.episode_limit):
@@ -158,7 +141,7 @@ def _bodies(robot: HostRobot, seeds: Sequence[tuple[int, ...]]) -> Bodies:
     return bodies
 
 
-def _zeros(environment: Environment[Any], simulator: NeuronSimulator | None, shape: tuple[int, int]) -> Counts:
+def _zeros(environment: Environment[Any], simulator: Neurons, shape: tuple[int, int]) -> Counts:
     """Counts of 0, for `shape` = (actors, episodes)."""
     n = 0 if simulator is None or environment.n_actions is None else environment.n_actions
     return Counts(
@@ -178,7 +161,7 @@ def _started(environment: Environment[Any], keys: Key[Array, " actors"], episode
 @partial(jax.jit, static_argnums=0, compiler_options=COMPILER_OPTIONS)
 def _iteration(
     environment: Environment[Any],
-    simulator: NeuronSimulator | None,
+    simulator: Neurons,
     actors: Any,
     keys: Key[Array, " actors"],
     iteration: Array,

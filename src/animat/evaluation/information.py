@@ -11,12 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float64, Int
 
-from animat.environment import Environment
+from animat.environment import Environment, Neurons
 from animat.errors import InvalidArgument
-from animat.evaluation.rollouts import Actor
+from animat.evaluation.rollouts import Actor, trace
 from animat.evaluation.statistics import CONFIDENCE, Interval
-from animat.evaluation.traces import trace
-from animat.neurons.simulator import NeuronSimulator
 from animat.robots.base import capability
 
 EPISODES = 64
@@ -50,12 +48,7 @@ class GoalInformation:
 
 
 def goal_information(
-    environment: Environment[Any],
-    simulator: NeuronSimulator | None,
-    actors: Actor,
-    *,
-    draws: int = DRAWS,
-    seed: int = 1,
+    environment: Environment[Any], simulator: Neurons, actors: Actor, *, draws: int = DRAWS, seed: int = 1
 ) -> GoalInformation:
     """How much information the chosen stimulus carries about the goal, given the sensors.
 
@@ -63,12 +56,8 @@ def goal_information(
 
     with s a state of each episode at a random iteration, and g the goals of the other episodes, each substituted for
     the state's own: sensors and all else stay the same. So goals do not depend on s, as they would if an actor had
-    been moving towards its own goal.
-
-    Args:
-        actors: one kind of actor, its arrays with a leading axis of actors.
-        draws: actions drawn at each state with each goal; 2 are enough for deterministic actors.
-        seed: decides every random draw.
+    been moving towards its own goal. `draws` are the actions drawn at each state with each goal; 2 are enough for
+    deterministic actors.
 
     Raises:
         InvalidArgument: for continuous actions, or a robot whose goal cannot be switched (`Robot.with_goal_of`).

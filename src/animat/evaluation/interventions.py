@@ -9,14 +9,12 @@ import numpy as np
 from jaxtyping import Float64
 
 from animat.columns import align_columns
-from animat.environment import Animat, Environment
+from animat.environment import Animat, Environment, Neurons
 from animat.errors import InvalidArgument
 from animat.evaluation.controls import Control, interventions_of
 from animat.evaluation.information import DRAWS, GoalInformation, goal_information, interval_of_mean
-from animat.evaluation.rollouts import Networks
+from animat.evaluation.rollouts import Networks, Traces, trace
 from animat.evaluation.statistics import Interval
-from animat.evaluation.traces import Traces, trace
-from animat.neurons.simulator import NeuronSimulator
 from animat.progress import Progress, Silent
 from animat.records import as_json
 from animat.tables import briefly
@@ -82,10 +80,7 @@ class SwitchEffect:
 
 @dataclass(frozen=True, eq=False)
 class InterventionTable:
-    """The policies as they are and with each intervention, on one simulator.
-
-    `turning` is the effect of the goal switch, None for a robot with only one goal.
-    """
+    """The policies as they are and with each intervention, and the effect of a switch of the goal, if there is one."""
 
     __repr__ = briefly
 
@@ -116,7 +111,7 @@ class InterventionTable:
 
 def run_interventions(
     environment: Environment[Any],
-    simulator: NeuronSimulator | None,
+    simulator: Neurons,
     policies: Networks,
     *,
     episodes: int,
@@ -125,11 +120,7 @@ def run_interventions(
 ) -> InterventionTable:
     """Run policies as they are and with every intervention of `animat.evaluation.controls.interventions_of`.
 
-    The goal is switched in the middle of the policies' median episode. `episodes` are of each policy and intervention;
-    `seed` decides every random draw.
-
-    Raises:
-        InvalidArgument: for an environment without neurons.
+    The goal is switched in the middle of the policies' median episode. Refuses an environment without neurons.
     """
     if simulator is None or not isinstance(unwrapped(environment), Animat):
         raise InvalidArgument("interventions: expected policies that act through neurons, got policies without neurons")

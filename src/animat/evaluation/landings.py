@@ -17,7 +17,6 @@ from animat.robots.base import Robot
 from animat.robots.grid import Grid
 
 ENDED, ENDS_NEXT = -1, -2
-
 _NODES_AT_ONCE = 1 << 18
 
 

@@ -14,28 +14,24 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64, Int32, UInt16
 
 from animat.arguments import checked_arguments
-from animat.environment import Environment
+from animat.environment import Environment, Neurons
 from animat.errors import InvalidArgument, Mismatch
 from animat.evaluation.commands import CLASSES, class_of, commands_after, is_shuffled, memory_of, nodes_for
 from animat.evaluation.landings import Motion, Outcomes, side_by_side
 from animat.evaluation.statistics import Interval, standard_error
 from animat.evaluation.sweeping import bellman_backup, cubic, fill_row_weights, look_ahead
 from animat.neurons.history import INITIAL_HISTORY
-from animat.neurons.simulator import NeuronSimulator
 from animat.progress import Part, Progress, Silent
 from animat.recordings.findings import Finding
 from animat.robots.grid import Grid, grid_for
 from animat.wrappers import TrialCosts, net_reward, unwrapped
 
-Case = tuple[Environment[Any], NeuronSimulator | None]
+Case = tuple[Environment[Any], Neurons]
 """An environment, and the simulator in it (None without neurons)."""
-
 COARSER = 0.75
 """Steps along each axis of the comparison grid, as a share of those of the grid in use."""
-
 _SAME = 0.01
 """Returns that differ by less count as equal: the standard error is 0 in a deterministic environment."""
-
 _STARTS = 2**14
 """Starts over which a value is averaged: with two goals that are worth 50 more and less, to within 0.4."""
 _MOST_MIB = 16_384
@@ -53,13 +49,10 @@ class Optimum:
         grid_error: difference from the value on a grid with 3/4 of the steps along each axis.
         monte_carlo: mean return of that controller, run on the environment itself: an achievable return, the lower end
             of the bracket. NaN if it was not run, as are the next three.
-        standard_error: of `monte_carlo`.
         without_clock: mean return of the same controller if it always acts as if the whole episode lay ahead: what is
             achievable without knowing the time, like a policy. A better one may exist, not above `value`.
-        without_clock_standard_error: of `without_clock`.
         episodes: in which both were measured; 0 if the controller was not run.
-        nodes: of the grid.
-        interval: of the value, given the number of responses (`animat.evaluation.resampling`); None if it was not
+        interval: of the value, given the number of responses (`animat.evaluation.optimal_returns`); None if it was not
             computed.
         left_out: conditions with too few responses, with their number.
     """
@@ -115,7 +108,7 @@ def bracket_findings(value: float, grid_error: float, monte_carlo: float, error:
 
 
 @checked_arguments
-def best_return(environment: Environment[Any], simulator: NeuronSimulator | None, **options: Any) -> Optimum:
+def best_return(environment: Environment[Any], simulator: Neurons, **options: Any) -> Optimum:
     """The optimal return in one environment; arguments, errors and method as in `best_returns`."""
     return best_returns([(environment, simulator)], **options)[0]
 

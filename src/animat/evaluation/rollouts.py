@@ -6,21 +6,22 @@ import abc
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, final
+from typing import Any, NamedTuple, final
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Float64, Int, Int64, Key, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Float64, Int, Int64, Key, PRNGKeyArray, Shaped
 
 from animat.compilation import COMPILER_OPTIONS
-from animat.environment import Environment
+from animat.environment import Environment, Neurons, State
 from animat.errors import InvalidArgument, expect_at_least, shown
+from animat.evaluation.commands import mean_commands
 from animat.evaluation.host_rollouts import roll_out_on_host
 from animat.goals.robot import RobotWithGoal
 from animat.goals.tally import Outcome
-from animat.neurons.simulator import NeuronSimulator, stacked
-from animat.robots.base import MOST_AT_ONCE
+from animat.neurons.simulator import stacked
+from animat.robots.base import MOST_AT_ONCE, capability
 from animat.robots.host import HostRobot
 from animat.tables import briefly
 from animat.training.networks import Layer, Network, as_commands, draw_action, likeliest_action
@@ -103,13 +104,42 @@ def nearest_action(
     return actions[jnp.argmin(distance, axis=1)]
 
 
+@final
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class HeuristicPolicy(Actor):
+    """The action whose mean command is nearest to that of the robot's `heuristic`, which sees only the robot.
+
+    Attributes:
+        actions: the environment's input for each action, shape (1, actions), for one actor; None where any command can
+            be given (without neurons, continuous ones).
+        means: the mean command of each action, the same shape, or (1, actions, commands) for several commands.
+    """
+
+    actions: Array | None = None
+    means: Float[Array, "..."] | None = None
+
+    def act(self, environment: Environment[Any], observation: Seen, uniforms: Uniforms) -> Array:
+        of_robot = (observation * environment.scales)[:, : len(environment.robot.observation_spec)]
+        wanted: Array = jax.vmap(capability(environment.robot, "heuristic"))(of_robot)
+        return nearest_action(self.actions, self.means, wanted)
+
+
+def heuristic_policy(environment: Environment[Any], simulator: Neurons) -> HeuristicPolicy:
+    """The heuristic policy for an environment, as one actor; InvalidArgument for a robot without a `heuristic`."""
+    capability(environment.robot, "heuristic")
+    if environment.n_actions is None:
+        return HeuristicPolicy()
+    actions, means = mean_commands(environment, simulator)
+    return HeuristicPolicy(jnp.asarray(actions)[None], jnp.asarray(means, jnp.float32)[None])
+
+
 @dataclass(frozen=True, eq=False)
 class Episodes:
     """Results of episodes of several actors.
 
     Attributes:
         returns: sum of rewards of each episode, in the task's own units.
-        lengths: iterations of each.
         terminated: whether it ended by itself and not at the episode limit.
         presented: how often each condition was delivered, in all episodes together; no conditions without neurons.
         commanded: the sum of the commands that each condition led to; several commands separately.
@@ -148,11 +178,7 @@ def check_at_once(name: str, episodes: int, n_actors: int) -> None:
 
 
 def networks_of(policies: Sequence[Policy], *, greedy: bool = False) -> Networks:
-    """Stack the networks of policies that share one shape.
-
-    Raises:
-        InvalidArgument: if there are none, or their shapes differ.
-    """
+    """Stack the networks of policies; raises InvalidArgument if there are none, or their shapes differ."""
     if not policies:
         raise InvalidArgument("policies: expected at least one, got none")
     if len({tuple(w.shape for w in policy.weights) for policy in policies}) > 1:
@@ -165,20 +191,12 @@ def networks_of(policies: Sequence[Policy], *, greedy: bool = False) -> Networks
 
 
 def roll_out(
-    environment: Environment[Any],
-    simulator: NeuronSimulator | None,
-    actors: Actor,
-    *,
-    episodes: int,
-    seed: int,
-    alike: bool = False,
+    environment: Environment[Any], simulator: Neurons, actors: Actor, *, episodes: int, seed: int, alike: bool = False
 ) -> Episodes:
     """Run episodes of several actors on one simulator.
 
     Args:
-        simulator: None without neurons.
         actors: one kind of actor, its arrays with a leading axis of actors.
-        episodes: of each actor.
         seed: decides every random draw, together with an actor's place.
         alike: whether all actors get the same random numbers, so that only their actions differ.
 
@@ -200,11 +218,7 @@ def roll_out(
 
 @partial(jax.jit, static_argnums=(0, 1), compiler_options=COMPILER_OPTIONS)
 def _roll_out(
-    environment: Environment[Any],
-    episodes: int,
-    simulator: NeuronSimulator | None,
-    actors: Actor,
-    keys: Key[Array, " actors"],
+    environment: Environment[Any], episodes: int, simulator: Neurons, actors: Actor, keys: Key[Array, " actors"]
 ) -> tuple[Any, ...]:
     n_conditions = 0 if simulator is None or environment.n_actions is None else environment.n_actions
     n_drawn = environment.n_drawn
@@ -250,3 +264,50 @@ def _roll_out(
     robot = environment.robot
     outcome = jax.vmap(jax.vmap(robot.outcome))(last.robot) if isinstance(robot, RobotWithGoal) else None
     return *counted, outcome
+
+
+class Traces(NamedTuple):
+    """Episodes of several actors; entries after the end of an episode are meaningless.
+
+    Attributes:
+        states: before each iteration and after the last (`State.carried`), each array with the axes of `observations`.
+    """
+
+    states: State
+    observations: Float[np.ndarray, "actors episodes iterations+1 observations"]
+    actions: Shaped[np.ndarray, "actors episodes iterations *commands"]
+    commands: Float[np.ndarray, "actors episodes iterations *commands"]
+    lengths: Int[np.ndarray, "actors episodes"]
+
+
+def trace(environment: Environment[Any], simulator: Neurons, actors: Actor, *, episodes: int, seed: int) -> Traces:
+    """Run episodes of each actor on a robot in JAX; arguments as in `roll_out`."""
+    n_actors = actors.n_actors
+    keys = jax.random.split(jax.random.key(seed), n_actors * episodes).reshape(n_actors, episodes)
+    traced: Traces = jax.device_get(_trace(environment, simulator, actors, keys))
+    return traced
+
+
+@partial(jax.jit, static_argnums=0)
+def _trace(environment: Environment[Any], simulator: Neurons, actors: Actor, keys: Any) -> Traces:
+    n_drawn = environment.n_drawn
+
+    def one_episode(actor: Actor, key: Any) -> Traces:
+        def iteration(carry: Any, key: Any) -> Any:
+            state, going = carry
+            uniforms = jax.random.uniform(key, (n_drawn + environment.noise_size,))
+            observation = environment.observe(state) / environment.scales
+            action = actor.act(environment, observation[None], uniforms[None, :n_drawn])[0]
+            after = environment.advance(uniforms[n_drawn:], state, action, simulator)
+            still = going & ~jnp.logical_or(*after.ended)
+            return (after.carried, still), (after.carried, action, after.info["command"], going)
+
+        start, key = jax.random.split(key)
+        first = environment.reset(start).carried
+        keys = jax.random.split(key, environment.robot.episode_limit)
+        _, (after, actions, commands, going) = jax.lax.scan(iteration, (first, jnp.bool_(True)), keys)
+        states = jax.tree.map(lambda one, more: jnp.concatenate([one[None], more]), first, after)
+        observations: Any = jax.vmap(environment.observe)(states)
+        return Traces(states, observations, actions, commands, going.sum())
+
+    return jax.vmap(lambda actor, of_actor: jax.vmap(partial(one_episode, actor))(of_actor))(actors, keys)

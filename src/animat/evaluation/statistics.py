@@ -1,18 +1,21 @@
-"""Rank comparisons of policies with effect sizes and intervals; and the score between random and the optimum."""
+"""Rank comparisons of policies with effect sizes, intervals and a verdict; the score between random and the optimum."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from typing import NamedTuple, Self
 
 import numpy as np
 from jaxtyping import Float64
 from numpy.typing import ArrayLike
 
-from animat.errors import InvalidArgument, shown
+from animat.errors import InvalidArgument, counted, shown
 
 CONFIDENCE = 0.95
+OUTPERFORMED_P = 0.01
+"""Policies count as better if p is below this, as in the paper's comparisons."""
 _MOST_PAIRS = 10_000
 """Pairs of samples up to which p is computed exactly: two groups of 100 take 0.1 s, and time and memory grow fast."""
 
@@ -22,7 +25,6 @@ class Interval:
     """An estimate with its confidence interval.
 
     Attributes:
-        value: the estimate from the samples.
         low, high: the interval's ends; infinite if the samples do not determine their spread.
         confidence: approximate share of such intervals that contain the true value.
     """
@@ -49,12 +51,10 @@ class Comparison:
     Attributes:
         u: Mann-Whitney's U as in the paper, the smaller of `u_first` and n1 n2 - `u_first`.
         u_first: number of pairs in which the first group's sample is larger, ties half.
-        n_first, n_second: number of samples.
         p_normal: by the normal approximation with corrections for continuity and ties, as in the paper.
         p_exact: over all ways to divide the samples, including ties; with more than 10,000 pairs `p_normal`.
         effect: rank-biserial correlation, share of pairs in which the second is larger less the share in which the
             first is, from -1 to 1, with its interval.
-        ties: whether any two samples are equal.
     """
 
     u: float
@@ -116,8 +116,7 @@ def p_of_u(u: float, n_first: int, n_second: int) -> float:
         z = (|U - m| - 1/2) / s,    m = n_1 n_2 / 2,    s^2 = n_1 n_2 (n_1 + n_2 + 1) / 12,
         p = min(1, 2 (1 - Phi(z)))
 
-    Raises:
-        InvalidArgument: for an empty group, or a U that is impossible for groups of these sizes.
+    Refuses an empty group, and a U that is impossible for groups of these sizes (InvalidArgument).
     """
     from scipy.stats import norm
 
@@ -167,11 +166,7 @@ def holm(p: Mapping[str, float]) -> dict[str, float]:
 
         p'_(i) = min(1, max_(j <= i) (m - j + 1) p_(j)),    p_(1) <= ... <= p_(m)
 
-    Args:
-        p: of each comparison, by name.
-
-    Raises:
-        InvalidArgument: for a p outside 0 to 1.
+    `p` is that of each comparison, by name; one outside 0 to 1 raises InvalidArgument.
 
     Source: Holm 1979, Scandinavian Journal of Statistics 6, 65-70.
     """
@@ -253,3 +248,83 @@ def _shares_within(share: float, n_first: int, n_second: int) -> tuple[float, fl
     low = 0.0 if share <= close else float(brentq(against, 0.0, share - close))
     high = 1.0 if share >= 1 - close else float(brentq(against, share + close, 1.0))
     return low, high
+
+
+class EpisodeComparison(NamedTuple):
+    """Episodes of policies compared with those of a control.
+
+    Attributes:
+        p: of the two-sided Mann-Whitney test (normal approximation).
+        wins: share of pairs of episodes in which the policies' return is larger, ties half.
+        policies, control: number of episodes.
+    """
+
+    p: float
+    wins: float
+    policies: int
+    control: int
+
+    @property
+    def is_outperformed(self) -> bool:
+        """Whether the policies' returns are larger than the control's, in enough episodes to show it."""
+        return self.p < OUTPERFORMED_P and self.wins > 0.5 and self.has_enough_episodes
+
+    @property
+    def has_enough_episodes(self) -> bool:
+        """Whether this number of episodes could give a small p at all: if all of the policies' were larger."""
+        return p_of_u(0.0, self.policies, self.control) < OUTPERFORMED_P
+
+
+def compare_episodes(policies: ArrayLike, control: ArrayLike) -> EpisodeComparison:
+    """Compare the returns (at least one, any shape) of all policies together with those of a control, by episodes."""
+    ours, theirs = np.ravel(policies), np.ravel(control)
+    u, p = mann_whitney(ours, theirs)
+    return EpisodeComparison(p, u / len(ours) / len(theirs), len(ours), len(theirs))
+
+
+def is_worse(p: float, wins: float) -> bool:
+    """Whether returns are smaller than a control's, by the test's p and the share of pairs of episodes won."""
+    return p < OUTPERFORMED_P and wins < 0.5
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Whether policies outperform each control; there is at least one."""
+
+    controls: Mapping[str, EpisodeComparison]
+
+    @classmethod
+    def of(cls, policies: ArrayLike, controls: Mapping[str, ArrayLike]) -> Self:
+        """From returns of episodes."""
+        return cls({name: compare_episodes(policies, returns) for name, returns in controls.items()})
+
+    @property
+    def not_outperformed(self) -> tuple[str, ...]:
+        """The controls whose returns the policies' are not shown to exceed (p < 0.01)."""
+        return tuple(name for name, each in self.controls.items() if not each.is_outperformed)
+
+    def __str__(self) -> str:
+        few = {name: each for name, each in self.controls.items() if not each.has_enough_episodes}
+        not_outperformed = [
+            f"{name} (p = {each.p:.2g}; {'they are worse: ' if is_worse(each.p, each.wins) else ''}their return is "
+            f"larger in {100 * each.wins:.0f} % of the pairs of episodes, ties counting half)"
+            for name, each in self.controls.items()
+            if not each.is_outperformed and each.has_enough_episodes
+        ]
+        parts = []
+        if not_outperformed:
+            parts.append(f"the policies do not outperform these controls: {', '.join(not_outperformed)}")
+        if few:
+            fewest = min(few.values(), key=lambda each: each.control)
+            parts.append(
+                f"{counted(fewest.policies, 'episode')} of the policies and "
+                f"{fewest.control} of a control are too few to show (p < {OUTPERFORMED_P:g}) whether the policies "
+                f"outperform {', '.join(few)}"
+            )
+        if not parts:
+            least = min(each.wins for each in self.controls.values())
+            parts.append(
+                f"the policies outperform every control (p < {OUTPERFORMED_P:g}; their return is larger in at least "
+                f"{100 * least:.0f} % of the pairs of episodes, ties counting half)"
+            )
+        return "; ".join(parts)

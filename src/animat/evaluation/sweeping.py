@@ -169,10 +169,7 @@ def look_ahead(
     remaining: int,
     chosen: Int32[np.ndarray, " states"],
 ) -> None:
-    """The best action in each of some states of one case, by the values of the next states (see `bellman_backup`).
-
-    `layers` are those of the states among the case's, and `chosen` is the output.
-    """
+    """Choose the best action in each of some states, by the values of the next states (see `bellman_backup`)."""
     n_states = nodes.shape[1]
     _, n_actions, n_outcomes = weights.shape
     n_taps = len(row_offsets)

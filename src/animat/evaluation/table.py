@@ -12,21 +12,18 @@ import numpy as np
 from animat.arguments import checked_arguments
 from animat.coding.electrode_pulses import electrode_pulses
 from animat.columns import align_columns
-from animat.environment import Animat, Environment, WithoutNeurons
-from animat.errors import InvalidArgument, Mismatch, UnusableData, counted, expect_several, in_min
+from animat.environment import Animat, Environment, Neurons, WithoutNeurons
+from animat.errors import InvalidArgument, Mismatch, UnusableData, counted, in_min
 from animat.evaluation import transfer
-from animat.evaluation.controls import Control, controls_of, coupling_of
+from animat.evaluation.controls import Control, Row, controls_of, coupling_of
 from animat.evaluation.coupling import ContextGap, context_gap, least_context_gap
 from animat.evaluation.interventions import InterventionTable, run_interventions
+from animat.evaluation.optimal_returns import WellSampled
 from animat.evaluation.optimum import Optimum, best_return
-from animat.evaluation.resampling import WellSampled
 from animat.evaluation.rollouts import networks_of
-from animat.evaluation.row import Row
-from animat.evaluation.statistics import Interval, normalised_score
-from animat.evaluation.verdict import Verdict
+from animat.evaluation.statistics import Interval, Verdict, normalised_score
 from animat.goals.robot import objectives_of
 from animat.goals.tally import MEANS, cells_of, satisfaction_line
-from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import SimulatorTimeline
 from animat.progress import Part, Progress, Silent, in_phase
 from animat.recordings.findings import Finding
@@ -42,7 +39,6 @@ class Evaluation:
     """Trained policies and controls on one simulator.
 
     Attributes:
-        robot: the robot.
         mapping: its name; None without neurons.
         recorded_at_min: time of the simulator's recording; None without neurons.
         names: the policies, in the order of the first row's actors.
@@ -251,7 +247,7 @@ def evaluate(
         labels = [f"{command:+g}" for command in first.commands or ()]
     all_controls = controls_of(*within, labels, networks)
     if controls is not None:
-        controls, known = expect_several("controls", controls, str, "names"), [each.name for each in all_controls]
+        controls, known = (controls,) if isinstance(controls, str) else controls, [each.name for each in all_controls]
         # A robot may lack a heuristic, and the coupling is searched with the optimum only.
         if unknown := sorted({*controls} - {*known, "heuristic", "coupling"}):
             raise InvalidArgument(f"controls: expected some of {', '.join(known)}, got {', '.join(unknown)}")
@@ -308,7 +304,7 @@ class _World:
 
     first: Policy
     environment: Environment[Any]
-    simulator: NeuronSimulator | None = None
+    simulator: Neurons = None
     timeline: SimulatorTimeline | None = None
     minute: float | None = None
     fixed_from_min: float | None = None

@@ -15,7 +15,6 @@ from animat.stimulation.protocol import Presentation
 from animat.training.policy import Policy
 
 UNKNOWN = "unknown-presentation"
-
 OLD_MIN = 30.0
 """Age of a recording above which a warning says that the culture may have drifted."""
 

@@ -28,13 +28,9 @@ class Range:
     The range between `low` and `high` includes its ends; a range beyond one end, or outside, does not.
 
     Attributes:
-        quantity: name of a quantity that a robot observes.
         low, high: its ends; None: there is none.
         unit: of the ends; empty for a quantity without a unit.
         outside: whether it is the range outside the two ends.
-
-    Raises:
-        InvalidArgument: for no ends, or ends with nothing between them.
     """
 
     quantity: Name
@@ -93,9 +89,7 @@ class Ball:
     """A disc or ball of values of several quantities with the same unit, including its edge.
 
     Attributes:
-        quantities: names of quantities that a robot observes.
-        centre: one number for each.
-        radius: around the centre.
+        centre: one number for each of the quantities.
         unit: of centre and radius; empty for quantities without a unit.
     """
 

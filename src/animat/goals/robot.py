@@ -13,10 +13,9 @@ from jaxtyping import Bool, Float, Int
 
 from animat.arguments import checked_arguments
 from animat.errors import InvalidArgument, shown, within
-from animat.goals.goal import Goal, Objective
+from animat.goals.goal import Goal, Objective, is_text, read_goal
 from animat.goals.region import margin_of, region_in_units
 from animat.goals.tally import Margins, Outcome, Tally, add_iteration, empty_tally, outcome
-from animat.goals.text import is_text, read_goal
 from animat.lazy import Array, jax, jnp
 from animat.robots.base import WITHOUT, Quantity, Robot, Transition, Uniforms, capability
 from animat.robots.grid import Grid
@@ -25,7 +24,6 @@ from animat.robots.registry import robot_from_dict, robot_named, robot_to_dict
 
 FAILED, REACHED = 100.0, 50.0
 """Cost of failing and reward of reaching, with equal weights."""
-
 POTENTIAL = 3.0
 """Depth of the potential a whole scale or more away from a region: the pay of three iterations."""
 
@@ -271,8 +269,7 @@ def with_goal(robot: Robot[Any] | str, goal: Goal | str) -> RobotWithGoal:
     """A robot with a goal in place of its own task.
 
     Args:
-        robot: a robot or its name.
-        goal: a goal or its text, `"avoid pole_angle outside -12..12 deg"` (`animat.goals.text`).
+        goal: a goal or its text, `"avoid pole_angle outside -12..12 deg"` (`animat.goals.goal`).
 
     Raises:
         InvalidArgument: as `RobotWithGoal`, and for a text that is not a goal.

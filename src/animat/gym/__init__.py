@@ -28,7 +28,7 @@ def register_environments() -> None:
             # No max_episode_steps: the robot's episode limit truncates, and is an option like all others.
             register(
                 id_,
-                entry_point="animat.gym.single:AnimatEnv",
-                vector_entry_point="animat.gym.vector:AnimatVectorEnv",
+                entry_point="animat.gym.environments:AnimatEnv",
+                vector_entry_point="animat.gym.environments:AnimatVectorEnv",
                 kwargs={} if robot is None else {"robot": robot},
             )

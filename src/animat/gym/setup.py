@@ -16,16 +16,15 @@ from animat.coding.decoder import expect_fit
 from animat.coding.mapping import Mapping, mapping_named
 from animat.environment import Animat, Environment
 from animat.errors import InvalidArgument, expect_kind, expect_several
-from animat.neurons.kinds import Kind
 from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.synthetic import LABELS, synthetic_simulator
-from animat.neurons.timeline import fit_timeline
+from animat.neurons.timeline import Kind, fit_timeline
 from animat.recordings.findings import warnings_once
 from animat.recordings.reading import read_sources
 from animat.registry import is_ours
 from animat.responses.conditions import conditions_named
+from animat.responses.extraction import extract_series
 from animat.responses.readouts import DEFAULT_READOUTS, Readouts
-from animat.responses.series import extract_series
 from animat.responses.windows import DEFAULT_WINDOW_MS, check_window
 from animat.robots.checking import check_robot
 from animat.robots.host import HostRobot

@@ -30,13 +30,12 @@ from animat.live.plan import (
     for_the_first_recording,
 )
 from animat.live.trainers import Trainers
-from animat.neurons.kinds import Kind
-from animat.neurons.timeline import SimulatorTimeline, fit_timeline
+from animat.neurons.timeline import Kind, SimulatorTimeline, fit_timeline
 from animat.progress import Part, Progress, in_phase
 from animat.reality_gap import Calibration, RealityGap, run_policies
 from animat.recordings.formats.nwb import recording_name, write_nwb
+from animat.responses.extraction import extract_series
 from animat.responses.responses import Responses
-from animat.responses.series import extract_series
 from animat.stimulation.protocol import Protocol
 from animat.training.folder import describe, groups_of
 from animat.training.policy import Policy

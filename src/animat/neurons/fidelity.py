@@ -9,15 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from animat.neurons.joint_histogram import JointHistogramSimulator
 from animat.neurons.memory import MemorySimulator
-from animat.neurons.simulator import HistogramSimulator, NeuronSimulator
+from animat.neurons.simulator import HistogramSimulator, JointHistogramSimulator, NeuronSimulator
 from animat.recordings.findings import Finding
 from animat.responses.responses import Responses
 
 LARGEST_LOSS = 0.05
 """A difference in P(x >= P50) between data and simulator above which `findings` warns."""
-
 _evenly_drawn = jax.jit(NeuronSimulator.evenly_drawn, static_argnums=1)
 """Compiled once for all simulators of a shape."""
 
@@ -31,7 +29,6 @@ class Fidelity:
             several readouts.
         in_simulator: the same for the simulator, in the same shape.
         n_above_range: non-burst responses, of any readout, above a histogram's range, counted in its last bin.
-        readouts: their names.
     """
 
     labels: tuple[str, ...]

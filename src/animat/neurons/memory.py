@@ -257,10 +257,7 @@ def _slopes(
 def _errors(
     rank: Float64[np.ndarray, " responses"], in_order: Sequence[Int64[np.ndarray, " rows"]], neighbour_exponent: float
 ) -> Float64[np.ndarray, " rows"]:
-    """Squared differences between each response's rank and the mean rank of its n^neighbour_exponent neighbours.
-
-    The responses to each condition are in the order of their histories.
-    """
+    """Squared differences of each rank from the mean rank of its n^neighbour_exponent neighbours by history."""
     errors = np.full(len(rank), np.nan)
     for rows in in_order:
         n = len(rows)

@@ -1,24 +1,33 @@
-"""Predictions of each response in the second half of a recording by simulators of the first half, and their scores."""
+"""Predictions of the second half of a recording by simulators of the first: response by response, and in free runs."""
 
 from __future__ import annotations
 
+import warnings
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Float32, Float64, Int64
+from jaxtyping import Array, Float, Float32, Float64, Int64
 
 from animat.errors import UnusableData
 from animat.neurons.history import Ranked
-from animat.neurons.joint_histogram import JointHistogramSimulator
 from animat.neurons.memory import MemorySimulator
-from animat.neurons.simulator import EmpiricalSimulator, HistogramSimulator, NeuronSimulator, pooled_percentiles
+from animat.neurons.simulator import (
+    EmpiricalSimulator,
+    HistogramSimulator,
+    JointHistogramSimulator,
+    NeuronSimulator,
+    pooled_percentiles,
+)
 from animat.responses.responses import Responses
 
 FEWEST = 20
 """Non-burst responses of each condition needed in each half: fewer do not make a distribution."""
 CLASSES = 10
 """Between the percentiles P10 to P90: the commands of nine thresholds."""
+LAGS = 10
+"""The largest lag of correlations, and the largest run length counted separately."""
 
 
 class Halves(NamedTuple):
@@ -58,8 +67,7 @@ class Halves(NamedTuple):
 def halved(responses: Responses, readout: int | None = None) -> Halves:
     """Split a recording's responses in the middle: by time, or within each condition if presented in blocks.
 
-    Raises:
-        UnusableData: for a single condition, or a half with fewer than `FEWEST` non-burst responses to a condition.
+    Raises UnusableData for one condition, or a half with fewer than `FEWEST` non-burst responses to a condition.
     """
     labels = [condition.label for condition in responses.conditions]
     if len(labels) < 2:
@@ -197,3 +205,86 @@ def share_below(
     low, high = transforms.T[:, :, None]
     within = (at - low) / np.maximum(high - low, 1e-12)
     return np.asarray(np.clip(within, 0.0, 1.0).mean(axis=0))
+
+
+def recorded_series(halves: Halves) -> Float64[np.ndarray, " presentations"]:
+    """The held-out responses at their places among all trials, NaN elsewhere."""
+    presented, place = halves.whole.presentations
+    series = np.full(len(presented.rate_hz), np.nan)
+    series[place[halves.rows]] = halves.x_hz
+    return series
+
+
+def free_runs(
+    simulator: NeuronSimulator | None, prediction: Prediction, n: int, rng: np.random.Generator
+) -> Float64[np.ndarray, "n presentations"]:
+    """Draw n series of responses from a simulator in place of the held-out half.
+
+    Conditions and times are the recorded ones. A simulator with memory remembers its own answers; for trials that it
+    does not answer (bursts, trials without a condition or in the first half) the recorded history is used. Responses
+    are at the places of the recorded ones; elsewhere is NaN.
+    """
+    halves = prediction.halves
+    presented, place = halves.whole.presentations
+    places = place[halves.rows]
+    runs = np.full((n, len(presented.rate_hz)), np.nan)
+    if not isinstance(simulator, MemorySimulator):
+        at_most, uniform = prediction.at_most, rng.random((len(places), n))
+        drawn = [np.searchsorted(row[:-1], u, side="right") for row, u in zip(at_most, uniform, strict=True)]
+        runs[:, places] = halves.values_hz[np.stack(drawn, axis=1)]
+        return runs
+    ranked, since = Ranked(halves.first), int(places[0])
+    traces, left = ranked.recorded(simulator.memory)
+    trials = (
+        np.maximum(presented.condition, 0),
+        ranked.loads(simulator.memory.load_s).every.astype(np.float32),
+        left.astype(np.float32),
+        np.isin(np.arange(len(left)), places),
+        presented.is_burst,
+        presented.is_rested,
+    )
+    uniforms = rng.random((len(left) - since, n), np.float32)
+    rate_hz = _remembering(simulator, np.float32(traces[since]), tuple(each[since:] for each in trials), uniforms)
+    runs[:, places] = halves.read(np.asarray(rate_hz))[places - since].T
+    return runs
+
+
+@jax.jit
+def _remembering(
+    simulator: MemorySimulator, trace: Float[Array, ""], trials: tuple[Array, ...], uniforms: Float[Array, "trials n"]
+) -> Float[Array, "trials n *readouts"]:
+    """Answers of n runs to the trials, whose arrays are those of `free_runs`, from one trace on."""
+    answer = jax.vmap(simulator.answer_at, (None, 0, 0, None))
+
+    def trial(trace: Float[Array, " n"], inputs: tuple[Array, ...]) -> tuple[Array, Array]:
+        condition, load, left, is_answered, is_burst, is_rested, uniform = inputs
+        trace = jnp.where(is_rested, 0.0, trace)
+        rate_hz, after = answer(condition, uniform, trace, load)
+        after = jnp.where(is_answered, after, jnp.asarray(simulator.decay) * trace + left)
+        # As in `history.Ranked`: the trace after a burst is not known.
+        return jnp.where(is_burst, 0.5, after), rate_hz
+
+    return jax.lax.scan(trial, jnp.full(uniforms.shape[1], trace), (*trials, uniforms))[1]
+
+
+def autocorrelation(series: Float64[np.ndarray, "*n trials"]) -> Float64[np.ndarray, "*n lags"]:
+    """The correlation of responses with those 1 to `LAGS` trials before, over the existing pairs; NaN without any."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # Without pairs the mean is NaN.
+        apart = series - np.nanmean(series, axis=-1, keepdims=True)
+        of_lags = [np.nanmean(apart[..., :-lag] * apart[..., lag:], axis=-1) for lag in range(1, LAGS + 1)]
+        return np.asarray(np.stack(of_lags, axis=-1) / np.nanvar(series, axis=-1)[..., None])
+
+
+def run_lengths(series: Float64[np.ndarray, " trials"], threshold_hz: float) -> Int64[np.ndarray, " runs"]:
+    """The lengths of runs of trials with responses at or above a threshold; a missing response ends a run."""
+    passes = np.concatenate([[False], series >= threshold_hz, [False]])
+    edges = np.flatnonzero(np.diff(passes.astype(np.int8))).reshape(-1, 2)
+    return np.asarray(edges[:, 1] - edges[:, 0])
+
+
+def shares_lasting(lengths: Int64[np.ndarray, " runs"]) -> Float64[np.ndarray, " lengths"]:
+    """The shares of runs that last 1, 2, ..., `LAGS` trials or more; NaN without runs."""
+    if not len(lengths):
+        return np.full(LAGS, np.nan)
+    return np.asarray(np.mean(lengths[:, None] >= np.arange(1, LAGS + 1), axis=0))

@@ -1,4 +1,4 @@
-"""A culture's simulators over its recordings, from which parameter shadowing refreshes."""
+"""Simulators by their kind, and those of a culture over its recordings, from which parameter shadowing refreshes."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 import jax
 import numpy as np
@@ -17,10 +17,19 @@ from safetensors.numpy import save
 from animat.arguments import checked_arguments
 from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch, in_min
 from animat.neurons.fidelity import Fidelity, fidelity
-from animat.neurons.joint_histogram import JointHistogramSimulator
-from animat.neurons.kinds import Kind, fit_simulator
-from animat.neurons.memory import MemorySimulator
-from animat.neurons.simulator import EmpiricalSimulator, HistogramSimulator, NeuronSimulator, stacked, to_jax
+from animat.neurons.history import Memory
+from animat.neurons.memory import MemorySimulator, fit_memory
+from animat.neurons.simulator import (
+    EmpiricalSimulator,
+    HistogramSimulator,
+    JointHistogramSimulator,
+    NeuronSimulator,
+    fit_empirical,
+    fit_histogram,
+    fit_joint_histogram,
+    stacked,
+    to_jax,
+)
 from animat.recordings.findings import Finding
 from animat.recordings.recorded_culture import RecordedCulture, culture_of_series
 from animat.records import read_record
@@ -31,6 +40,9 @@ from animat.responses.responses import Responses
 from animat.stimulation.protocol import Presentation
 from animat.tables import briefly
 from animat.writing import write_whole
+
+Kind = Literal["histogram", "empirical", "memory"]
+"""Draw from a distribution in bins (the paper); a measured response; or one measured after a similar history."""
 
 _MEMORY_OF_BLOCKS = Finding(
     "memory-of-blocks",
@@ -112,15 +124,13 @@ class SimulatorTimeline:
         # Extracted on the host: JAX would compile a program for each shape.
         return jax.tree.map(lambda each: to_jax(np.asarray(each)[row], None), self.simulators)  # type: ignore[no-any-return]
 
-    def with_first_percentiles(self) -> SimulatorTimeline:
-        """The same simulators with the first recording's percentiles, for mappings with fixed thresholds."""
+    def with_percentiles(self, which: str) -> SimulatorTimeline:
+        """These simulators, each with its own percentiles (`"moving"`) or with the first recording's (`"first"`)."""
+        if which != "first":
+            return self
         percentiles = np.asarray(self.simulators.percentiles)
         held = to_jax(np.broadcast_to(percentiles[:1], percentiles.shape), None)
         return replace(self, simulators=replace(self.simulators, percentiles=held))  # type: ignore[type-var]
-
-    def with_percentiles(self, which: str) -> SimulatorTimeline:
-        """These simulators, each with its own percentiles (`"moving"`) or with the first recording's (`"first"`)."""
-        return self.with_first_percentiles() if which == "first" else self
 
 
 def room_for(series: Sequence[Responses]) -> int:
@@ -147,9 +157,7 @@ def fit_timeline(
         kind: `"histogram"` (the paper), `"empirical"` (draw a measured value) or `"memory"` (draw one measured after a
             similar history); None: `"memory"`, but `"histogram"` if stimuli were presented in blocks, which do not show
             how a culture responds after a different condition.
-        bins: of a histogram.
-        range_hz: upper end of a histogram's equally wide bins, Hz, the same for all; None: each recording's own
-            percentiles are the edges (`fit_histogram`).
+        bins, range_hz: of a histogram, the same for all recordings, as in `fit_histogram`.
 
     Raises:
         InvalidArgument: if there are no responses or the kind is unknown.
@@ -242,3 +250,27 @@ def load_timeline(path: Path) -> SimulatorTimeline:
             f"{path}: expected simulators as animat study and animat tune write them, got a file that cannot be read "
             f"as such: {reason}; run the command again to replace it"
         ) from error
+
+
+def fit_simulator(
+    responses: Responses,
+    *,
+    kind: str = "histogram",
+    bins: int = 20,
+    range_hz: float | None = None,
+    room: int | None = None,
+    memory: Memory | None = None,
+) -> NeuronSimulator:
+    """Fit a simulator of a `Kind`; arguments and errors are those of `fit_histogram`, `fit_empirical` and `fit_memory`.
+
+    Histograms of several readouts need `room`, too.
+    """
+    if kind == "histogram" and len(responses.readouts) > 1:
+        return fit_joint_histogram(responses, bins=bins, range_hz=range_hz, room=room)
+    if kind == "histogram":
+        return fit_histogram(responses, bins=bins, range_hz=range_hz)
+    if kind == "empirical":
+        return fit_empirical(responses, room=room)
+    if kind == "memory":
+        return fit_memory(responses, room=room, memory=memory)
+    raise InvalidArgument(f"kind: expected one of {', '.join(get_args(Kind))}, got {kind!r}")

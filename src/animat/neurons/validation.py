@@ -11,12 +11,22 @@ from jaxtyping import Float64
 
 from animat.arguments import checked_arguments
 from animat.errors import InvalidArgument
-from animat.neurons.free_runs import autocorrelation, free_runs, recorded_series, run_lengths, shares_lasting
 from animat.neurons.history import NO_MEMORY
-from animat.neurons.kinds import Kind, fit_simulator
 from animat.neurons.memory import MemorySimulator
-from animat.neurons.prediction import CLASSES, Halves, halved, predict, predict_marginal, share_below
-from animat.neurons.timeline import default_kind
+from animat.neurons.prediction import (
+    CLASSES,
+    Halves,
+    autocorrelation,
+    free_runs,
+    halved,
+    predict,
+    predict_marginal,
+    recorded_series,
+    run_lengths,
+    share_below,
+    shares_lasting,
+)
+from animat.neurons.timeline import Kind, default_kind, fit_simulator
 from animat.responses.responses import Responses
 from animat.tables import briefly
 
@@ -214,7 +224,6 @@ def validate(responses: Responses, *, kind: str | None = None, seed: int = 1, re
     """Fit all kinds of simulators to the first half of a recording's responses, and score them on the second.
 
     Args:
-        responses: of one recording.
         kind: that the verdict is about; None: the one that training would use.
         seed: of the free runs and the chance levels.
         readout: which of several readouts is scored; simulators answer for all of them.

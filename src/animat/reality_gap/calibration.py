@@ -12,17 +12,15 @@ from jaxtyping import Float64
 from animat.arguments import checked_arguments
 from animat.closed_loop.adaptive import AdaptiveThresholds, kept_counts
 from animat.coding.mapping import Thresholds
-from animat.neurons.adjusted_rank import AdjustedRanks
 from animat.neurons.history import Ranked
-from animat.neurons.history_tracker import HistoryState, HistoryTracker
-from animat.neurons.kinds import Kind, fit_simulator
+from animat.neurons.history_tracker import AdjustedRanks, HistoryState, HistoryTracker
 from animat.neurons.memory import MemorySimulator
 from animat.neurons.simulator import NeuronSimulator
-from animat.neurons.timeline import fit_timeline, room_for
+from animat.neurons.timeline import Kind, fit_simulator, fit_timeline, room_for
 from animat.recordings.findings import Finding
 from animat.recordings.recorded_culture import RecordedCulture
 from animat.responses.condition import Condition
-from animat.responses.median_drift import MedianDrift, median_drift
+from animat.responses.quality.drift import MedianDrift, median_drift
 from animat.responses.readouts import ALL, Readouts
 from animat.responses.responses import Responses
 from animat.stimulation.protocol import Presentation
@@ -145,7 +143,7 @@ class Calibration:
         )
         if adaptive or policy is None or policy.percentiles != "first":
             return calibration
-        return calibration.with_percentiles(timeline.with_first_percentiles().at(start_min).percentiles)
+        return calibration.with_percentiles(timeline.with_percentiles("first").at(start_min).percentiles)
 
     def with_percentiles(self, percentiles: Any) -> Self:
         """The same with one set of percentiles in all simulators, independent of their responses."""

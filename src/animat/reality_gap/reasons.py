@@ -14,8 +14,7 @@ from animat.reality_gap.calibration import Calibration
 from animat.reality_gap.predicting import Prediction
 from animat.reality_gap.session_responses import SessionResponses
 from animat.recordings.findings import Finding
-from animat.responses.quality.memory import memory_findings
-from animat.responses.quality.repetition import repetitions
+from animat.responses.quality.history import memory_findings, repetitions
 from animat.responses.quality.responses import FEW_SAMPLES
 
 LEVEL = 0.01
@@ -226,7 +225,7 @@ def repetition(evidence: Evidence) -> Finding | None:
     """Responses depend on how often their condition was presented directly before, which simulators do not model.
 
     For three groups of responses by the number of repetitions, the mean of y less its mean over the session's responses
-    to the same condition; y: a response's rank less the effect of its history (`animat.neurons.adjusted_rank`), each
+    to the same condition; y: a response's rank less the effect of its history (`animat.neurons.history_tracker`), each
     readout separately. As in `answers`, its error is from differences between episodes.
     """
     from scipy.stats import t as student

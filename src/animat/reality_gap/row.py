@@ -8,8 +8,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from animat.evaluation.statistics import CONFIDENCE, Interval
-from animat.evaluation.verdict import EpisodeComparison
+from animat.evaluation.statistics import CONFIDENCE, EpisodeComparison, Interval
 from animat.records import as_json
 
 _RESAMPLES = 10_000

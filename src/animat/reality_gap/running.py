@@ -25,9 +25,9 @@ from animat.environment import Animat, Environment
 from animat.errors import InvalidArgument
 from animat.evaluation import transfer
 from animat.evaluation.controls import RANDOM, Control, controls_of, coupling_of, interventions_of
-from animat.evaluation.resampling import too_few
+from animat.evaluation.optimal_returns import too_few
 from animat.evaluation.rollouts import networks_of
-from animat.evaluation.verdict import compare_episodes
+from animat.evaluation.statistics import compare_episodes
 from animat.goals.tally import Outcome
 from animat.progress import Progress, in_phase
 from animat.reality_gap.calibration import Calibration

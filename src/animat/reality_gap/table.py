@@ -11,7 +11,7 @@ from animat.closed_loop.session_data import describe_left_out
 from animat.columns import align_columns
 from animat.cultures.budget import Account
 from animat.errors import in_min
-from animat.evaluation.verdict import Verdict
+from animat.evaluation.statistics import Verdict
 from animat.goals.robot import objectives_of
 from animat.goals.tally import MEANS, cells_of, satisfaction_line
 from animat.reality_gap.interventions import Intervention, intervention_lines

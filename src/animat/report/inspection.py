@@ -17,8 +17,8 @@ from animat.report.drift import draw_drift
 from animat.report.response_histograms import draw_burst_separation, draw_response_histograms, draw_responses_over_time
 from animat.report.spikes import draw_psth, draw_raster, draw_spontaneous
 from animat.report.style import save_figure
+from animat.responses.bursts import BIN_S, NetworkBursts
 from animat.responses.inspection import Inspection
-from animat.responses.network_bursts import BIN_S, NetworkBursts
 from animat.responses.psth import PostStimulusHistogram, post_stimulus_histogram
 from animat.responses.responses import Responses
 

@@ -22,7 +22,7 @@ from animat.report.style import (
     new_figure,
     style_axes,
 )
-from animat.responses.network_bursts import NetworkBursts
+from animat.responses.bursts import NetworkBursts
 from animat.responses.psth import PostStimulusHistogram
 from animat.responses.responses import Responses
 from animat.responses.windows import HALF_NS_S, spikes_in

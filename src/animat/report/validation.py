@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from animat.lazy import Figure
-from animat.neurons.free_runs import LAGS
+from animat.neurons.prediction import LAGS
 from animat.neurons.validation import FREE_RUNS, MARGINAL, PIT_BINS, Band, Validation, pit_shares
 from animat.report.style import BLACK, BLUE, GREEN, GREY, ORANGE, add_common_legend, new_figure, style_axes
 

@@ -1,4 +1,4 @@
-"""Burst separation: setting apart responses in which the whole culture fires, regardless of the stimulus."""
+"""Bursts, in which the whole culture fires: among its responses, regardless of the stimulus, and without stimuli."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from animat.errors import InvalidArgument
+from animat.recordings.recording import Recording
 
 LEAST_RESPONSES = 5
 """In each group."""
@@ -19,6 +20,10 @@ deviations of the lower group apart.
 
 Of samples of 60 to 1,500 responses from 24 distributions with one peak, 2 to 3 % pass as two groups, nearly all of them
 because of the long tail of a lognormal distribution (docs/evidence/responses.md)."""
+BIN_S = 0.05
+MOST_BINS = 10_000_000
+"""Five days; the bins of longer recordings are wider."""
+TIMES_MEDIAN, BY_CHANCE = 8.0, 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,9 +80,8 @@ def separate_bursts(
     valley of at least 0.8 between them, or of 0.5 if they are 8 standard deviations apart. Otherwise no response is a
     burst.
 
-    Args:
-        active_ratio: the share of the `n_channels` with at least one spike in the window, shape (responses,).
-        threshold: a ratio from 0 to 1 to use in any case; 1 keeps every response.
+    `active_ratio` is the share of the `n_channels` with at least one spike in the window. A given `threshold`, from
+    0 to 1, is used in any case; 1 keeps every response.
 
     Source: the paper's burst separation (Otsu's threshold over all ratios of a recording), which always cuts.
     """
@@ -128,3 +132,48 @@ def _valley(values: Float64[np.ndarray, " values"], is_upper: Bool[np.ndarray, "
         return 0.0
     lowest = between[np.argmin(density[between])]
     return float(1 - density[lowest] / min(density[: lowest + 1].max(), density[lowest:].max()))
+
+
+@dataclass(frozen=True, eq=False)
+class NetworkBursts:
+    """The bursts of a recording, on its clock, and the spikes of all channels in the bins in which they were found.
+
+    Attributes:
+        threshold: spikes in a bin above which it belongs to a burst.
+        share: the share of all spikes that are in bursts; NaN without spikes.
+    """
+
+    start_s: Float64[np.ndarray, " bursts"]
+    end_s: Float64[np.ndarray, " bursts"]
+    edges_s: Float64[np.ndarray, " edges"]
+    count: Float64[np.ndarray, " bins"]
+    threshold: float
+    share: float
+
+    def __len__(self) -> int:
+        return len(self.start_s)
+
+    @property
+    def median_s(self) -> float:
+        """Median duration in seconds; NaN without bursts."""
+        return float(np.median(self.end_s - self.start_s)) if len(self) else math.nan
+
+
+def find_network_bursts(recording: Recording) -> NetworkBursts:
+    """Find runs of 50 ms bins with far more spikes than usual, on all channels together.
+
+    A bin belongs to a burst if it holds more than 8 times the median bin, and more than independent spikes at the mean
+    rate (Poisson) would put into any bin in all but one of a hundred recordings.
+    """
+    from scipy.stats import poisson
+
+    # Times in a wrong unit must not exhaust the memory.
+    bin_s = max(BIN_S, recording.duration_s / MOST_BINS)
+    edges_s = recording.start_s + bin_s * np.arange(max(1, math.ceil(recording.duration_s / bin_s)) + 1)
+    count = np.histogram(recording.spike_times_s, edges_s)[0].astype(np.float64)
+    by_chance = float(poisson.isf(BY_CHANCE / len(count), count.mean()))
+    threshold = max(TIMES_MEDIAN * float(np.median(count)), by_chance)
+    above = np.concatenate([[False], count > threshold, [False]])
+    starts, ends = np.flatnonzero(above[1:] & ~above[:-1]), np.flatnonzero(above[:-1] & ~above[1:])
+    share = float(count[above[1:-1]].sum() / count.sum()) if count.sum() else math.nan
+    return NetworkBursts(edges_s[starts], edges_s[ends], edges_s, count, threshold, share)

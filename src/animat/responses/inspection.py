@@ -15,9 +15,9 @@ from animat.recordings.recording import Recording
 from animat.recordings.response_table import ResponseTable
 from animat.recordings.time_quality import TIME_UNITS
 from animat.records import as_json
+from animat.responses.bursts import NetworkBursts, find_network_bursts
 from animat.responses.conditions import Conditions
 from animat.responses.extraction import extract_responses
-from animat.responses.network_bursts import NetworkBursts, find_network_bursts
 from animat.responses.psth import ResponseTime, find_response, spontaneous_rate
 from animat.responses.responses import Responses
 from animat.responses.windows import DEFAULT_WINDOW_MS
@@ -148,9 +148,7 @@ def inspect_recording(
     """Inspect a recording as training would use it: its contents, and what is wrong with it.
 
     Args:
-        by: the rule of the conditions, or its text form, as in `extract_responses`.
-        window_ms: start and end of the window that responses are read in, after the pulse.
-        burst_threshold: a ratio of active channels in place of Otsu's threshold; 1 keeps every response.
+        by, window_ms, burst_threshold: as in `extract_responses`.
         name: what to call it; by default the source in its provenance.
 
     Raises:

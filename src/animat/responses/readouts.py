@@ -94,15 +94,8 @@ class Readouts:
 
             x = S / (T N),  S: spikes of the group's N channels in a window of T
 
-        Edges are as in `animat.responses.windows.count_spikes`.
-
-        Args:
-            members: which of its channels belong to each group (`members`).
-            after_s: times of the pulses, in seconds on the clock of the spikes.
-            window_ms: start and end of the window after each.
-
-        Returns:
-            A row per window; with a single readout, without the axis of readouts.
+        Edges are as in `animat.responses.windows.count_spikes`, and `members` is the result of that method. Pulses are
+        timed on the clock of the spikes. With a single readout there is no axis of readouts.
         """
         window, spike = spikes_in(recording, after_s + window_ms[0] * 1e-3, after_s + window_ms[1] * 1e-3)
         channel = recording.spike_channels[spike]
@@ -131,11 +124,7 @@ ALL = Readouts()
 
 
 def readouts_named(text: str) -> str | Readouts:
-    """The name of readouts (`all`, `halves`, `quadrants`), or groups of electrodes as JSON: `{"left": [1, 2]}`.
-
-    Raises:
-        InvalidArgument: for anything else.
-    """
+    """The name of readouts (`all`, `halves`, `quadrants`), or groups of electrodes as JSON: `{"left": [1, 2]}`."""
     if text in NAMED:
         return ALL if text == "all" else text
     if not text.lstrip().startswith("{"):

@@ -29,7 +29,6 @@ class Trials:
 
     Attributes:
         condition: index of each, `NO_CONDITION` if it has none.
-        rate_hz: x of each.
         is_rested: whether there was no pulse in the second before it.
         time_s: of the pulse after which it was read; None if it is not known.
     """

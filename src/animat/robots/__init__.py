@@ -12,25 +12,7 @@ from animat.robots.swing_up import SwingUp, SwingUpState
 from animat.robots.wheels import Wheels, WheelsState
 
 __all__ = [
-    "ROBOTS",
-    "ArmState",
-    "Cartpole",
-    "CartpoleState",
-    "Detour",
-    "GymnasiumRobot",
-    "Navigation",
-    "NavigationState",
-    "Quantity",
-    "Robot",
-    "Shuttle",
-    "ShuttleState",
-    "SwingUp",
-    "SwingUpState",
-    "TwoLinkArm",
-    "Wheels",
-    "WheelsState",
-    "register_robot",
-    "robot_from_dict",
-    "robot_named",
-    "robot_to_dict",
-]
+    "ROBOTS", "ArmState", "Cartpole", "CartpoleState", "Detour", "GymnasiumRobot", "Navigation", "NavigationState",
+    "Quantity", "Robot", "Shuttle", "ShuttleState", "SwingUp", "SwingUpState", "TwoLinkArm", "Wheels", "WheelsState",
+    "register_robot", "robot_from_dict", "robot_named", "robot_to_dict",
+]  # fmt: skip

@@ -19,16 +19,12 @@ from animat.robots.registry import register_robot
 
 SUBSTEPS = 4
 """Integration steps per iteration: damping settles a light link within a fraction of one."""
-
 STIFFEST = 2.5
 """Largest product of rate and step: the Runge-Kutta method of fourth order is stable up to 2.78."""
-
 TURN_RAD = 1.0
 """Largest turn of a joint in an integration step; with 2.5 times that, states grow without bound."""
-
 PULL, BRAKE_S = 40.0, 1.0
 """The heuristic's commands for a distance of one arm's length, and for a joint velocity of 1 rad/s."""
-
 NEAREST, FARTHEST = 0.3, 0.95
 """Range of the targets' distance from the shoulder, in arm's lengths, within what the tip can reach."""
 

@@ -169,10 +169,8 @@ class Cartpole(Robot[CartpoleState]):
         velocity v and the pole's angular velocity w so that v + 4/3 l w stays nearly the same. This sum changes only
         by gravity, slowly, and takes the place of v. The axis of angular velocities ends 10 % beyond where the pole can
         no longer be caught: r (angle limit + F / (M g)), with r the rate at which it falls, 1/s. That of velocities
-        ends at sqrt(g angle limit track length), from which leaning the pole can hardly stop the cart on its track.
-
-        Raises:
-            InvalidArgument: for a large angle limit.
+        ends at sqrt(g angle limit track length), from which leaning the pole can hardly stop the cart on its track. For
+        a large angle limit there is none (InvalidArgument).
         """
         if self.angle_limit_rad > 0.75:
             raise InvalidArgument(

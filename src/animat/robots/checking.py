@@ -25,7 +25,11 @@ def check_robot(robot: Robot[Any]) -> None:
     """Reset a robot and step it a few times, and refuse it (InvalidArgument) if an environment cannot use it."""
     _expect_attributes(robot)
     if isinstance(robot, HostRobot):
-        _check_on_host(robot)
+        bodies = Bodies(robot, [(0,)])
+        bodies.begin()
+        for u in np.linspace(-1.0, 1.0, _STEPS):
+            if bodies.step(np.full((1, robot.n_commands), u)).ended[0]:
+                bodies.begin()
     else:
         _check_compiled(robot)
     if (value_grid := getattr(robot, "value_grid", None)) is not None:
@@ -124,18 +128,8 @@ def _expect_grid(what: str, value_grid: Callable[[], Any]) -> None:
         raise InvalidArgument(f"{what}: expected a Grid, got {shown(grid)}")
 
 
-def _check_on_host(robot: HostRobot) -> None:
-    bodies = Bodies(robot, [(0,)])
-    bodies.begin()
-    for u in np.linspace(-1.0, 1.0, _STEPS):
-        if bodies.step(np.full((1, robot.n_commands), u)).ended[0]:
-            bodies.begin()
-
-
-def _expect_attributes(robot: Any) -> None:
+def _expect_attributes(robot: Robot[Any]) -> None:
     kind = type(robot).__name__
-    if not isinstance(robot, Robot):
-        raise InvalidArgument(f"robot: expected a robot or the name of one, got {shown(robot)}")
     for name, least, most in (
         ("n_commands", 1, MOST_COMMANDS),
         ("noise_size", 0, 10_000),

@@ -44,20 +44,14 @@ def draw_robot(
     earlier: Sequence[Float[np.ndarray, " observations"]] = (),
     height_px: int = 360,
 ) -> Picture:
-    """A picture of a robot as an observation describes it.
+    """A picture of a robot as an observation, in its own units, describes it: red, green and blue from 0 to 255.
 
     Args:
-        robot: one with a method `draw`.
-        observation: in the robot's own units.
         command: the motor command u in [-1, 1] that led to it; for several commands, an array or one value for all.
         earlier: the earlier observations of the episode.
-        height_px: height of the picture; its width follows.
-
-    Returns:
-        red, green, blue from 0 to 255.
 
     Raises:
-        InvalidArgument: for a robot without such a method, or if it raises or does not return a picture.
+        InvalidArgument: for a robot without a method `draw`, or if it raises or does not return a picture.
     """
     if robot.n_commands > 1:
         command = np.broadcast_to(command, robot.n_commands)
@@ -75,10 +69,7 @@ def draw_robot(
 
 
 def fit(width: float, height: float, height_px: int) -> tuple[float, int, float]:
-    """How to show a rectangle: pixels per unit, the width of the picture, and the space left above the rectangle (px).
-
-    The rectangle fills the picture, unless that would be too wide.
-    """
+    """Pixels per unit with which a rectangle fits a picture, the picture's width, and the space left above it (px)."""
     scale = height_px * min(1 / height, WIDEST / width)
     return scale, round(scale * width), (height_px - scale * height) / 2
 
@@ -93,15 +84,7 @@ def draw_over_time(
     success: str,
     ylabel: str,
 ) -> None:
-    """Draw one number of each episode over time, coloured by how the episode ended.
-
-    Args:
-        robot: one whose iterations last `step_s`.
-        values: for each episode, one number per iteration.
-        limits: drawn as horizontal lines.
-        success: what the episodes that ended well did: `end upright`.
-        ylabel: the number's name and unit.
-    """
+    """Draw one number of each episode over time, coloured by how the episode ended, well (`success`) or not."""
     for course, is_good in zip(values, ended_well, strict=True):
         time_s = np.arange(len(course)) * robot.step_s
         axes.plot(time_s, course, color=DONE if is_good else FAILED, linewidth=0.7, alpha=0.8)
@@ -112,10 +95,7 @@ def draw_over_time(
 
 
 class Canvas:
-    """A picture being drawn, with coordinates in the task's units.
-
-    It is drawn several times larger and reduced at the end, for smooth edges.
-    """
+    """A picture being drawn, with coordinates in the task's units; larger, and reduced at the end, for smooth edges."""
 
     def __init__(self, width_px: int, height_px: int, origin_px: Point, px_per_unit: float) -> None:
         """An empty picture with the task's (0, 0) at `origin_px` (x right, y down)."""

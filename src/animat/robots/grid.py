@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Int32
@@ -15,7 +15,6 @@ from animat.lazy import Array, jnp
 from animat.robots.base import Robot, capability
 
 _FINEST = 8192.0
-
 TAPS = 4
 """Nodes along an axis used to interpolate a value: cubic polynomials."""
 
@@ -25,13 +24,9 @@ class Axis:
     """Evenly spaced values of one coordinate.
 
     Attributes:
-        name, unit: of the coordinate.
         low, high: its ends; a state beyond them has the value of the end.
         nodes: number of values, at least 4, including both ends (for a periodic axis, only the lower one).
         periodic: whether `high` is the same as `low`.
-
-    Raises:
-        InvalidArgument: for ends that do not rise, or fewer than four nodes.
     """
 
     name: str
@@ -71,22 +66,6 @@ class Axis:
         place = jnp.mod(place, self.nodes) + 1 if self.periodic else jnp.clip(place, 0, self.nodes - 1)
         first = jnp.clip(jnp.floor(place) - 1, 0, self.stored - TAPS)
         return first.astype(jnp.int32), (place - first).astype(jnp.float32)
-
-
-class Located(NamedTuple):
-    """A state's place between the nodes of a grid.
-
-    Attributes:
-        row, row_places: first of the 4^axes rows around it, and the distances from it in steps, shape (axes,).
-        positions: places among all stored nodes of each axis, in steps, shape (axes,).
-        node, place: first of the four nodes around it along a row, and the distance from it in steps.
-    """
-
-    row: Array
-    row_places: Array
-    positions: Array
-    node: Array
-    place: Array
 
 
 @dataclass(frozen=True)
@@ -151,8 +130,12 @@ class Grid:
 
         return replace(self, along=scaled_axis(self.along), rows=tuple(map(scaled_axis, self.rows)))
 
-    def locate(self, state: Any) -> Located:
-        """A state's place between the nodes."""
+    def locate(self, state: Any) -> tuple[Array, Array, Array, Array, Array]:
+        """A state's place between the nodes.
+
+        The first of the 4^axes rows around it, and the distances from it in steps; the places among all stored nodes of
+        each of these axes; the first of the four nodes around it along a row, and the distance from it.
+        """
         along, *others = self.to_coordinates(state)
         row = jnp.int32(0)
         places, positions = [], []
@@ -162,7 +145,7 @@ class Grid:
             places.append(place)
             positions.append(first + place)
         row_places, at = (jnp.stack(each) if each else jnp.zeros(0, jnp.float32) for each in (places, positions))
-        return Located(row, row_places, at, *self.along.locate(along))
+        return row, row_places, at, *self.along.locate(along)
 
     def state_at(self, row: Array, node: Array) -> Any:
         """The robot's state at a node of a row."""

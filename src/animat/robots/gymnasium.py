@@ -19,8 +19,7 @@ from animat.errors import InvalidArgument, first_line, shown, within
 from animat.extras import install_command, pip_install
 from animat.records import Flag, Number, Whole, read_record, record
 from animat.robots.base import LARGEST_SCALE, LEAST_SCALE, Iterations, Quantity
-from animat.robots.host import LONGEST_KEPT, Body, HostRobot, time_limit
-from animat.robots.measuring import is_repeatable, measured_scales
+from animat.robots.host import LONGEST_KEPT, Bodies, Body, HostRobot, time_limit
 from animat.robots.registry import REGISTRY
 
 FAMILY = "gymnasium"
@@ -30,7 +29,10 @@ MOST_OBSERVED = 4_096
 MOST_LEVELS = 1_024
 LARGEST_BOUND = 1e6
 """Of an observation: a larger bound says nothing about its usual size."""
-
+_MEASURED_STEPS = 1_000
+"""Random commands, in consecutive episodes, by which scales are measured."""
+_REPEATED_STEPS = 50
+_SEED = 20_260_000
 Scale = Annotated[Number, Field(ge=LEAST_SCALE, le=LARGEST_SCALE)]
 
 
@@ -46,14 +48,9 @@ class GymnasiumRobot(HostRobot):
     Attributes:
         id: as for `gymnasium.make`, prefixed by `module:` if importing that module registers it.
         settings: arguments of `gymnasium.make`, by name.
-        episode_limit: iterations after which an episode is cut off.
         low, high: for each dimension of a Box; empty for a Discrete.
         levels: n of a Discrete(n); 0: a Box.
         scales: of each number of the flattened observation.
-        keeps_state: as in `HostRobot`.
-
-    Raises:
-        InvalidArgument: for parameters that no environment has.
     """
 
     id: str
@@ -154,9 +151,8 @@ class GymnasiumRobot(HostRobot):
         """The environment with this id, which is made, inspected, and moved at random for some steps.
 
         Args:
-            id: as for `gymnasium.make`.
+            id, settings: as for `gymnasium.make`.
             episode_limit: iterations after which an episode is cut off; None: the registered limit.
-            settings: arguments of `gymnasium.make`.
 
         Raises:
             InvalidArgument: if it does not exist or is not installed, has unsupported spaces, or has no limit.
@@ -289,3 +285,54 @@ def _observed(name: str, space: Any) -> list[float]:
     known = np.where((bound >= LEAST_SCALE) & (bound <= LARGEST_BOUND), bound, 0.0)
     # Without the digits that float32 adds.
     return [float(f"{size:.6g}") for size in known]
+
+
+def measured_scales(robot: HostRobot, bounds: Sequence[float]) -> tuple[float, ...]:
+    """The scale of each observed number: its bound, or, where that is 0 (not known), its root mean square.
+
+    The root mean square is over random commands. It has two digits, so that it does not depend on how a processor
+    rounds, and is 1 for a number that is always 0.
+    """
+    if all(bounds):
+        return tuple(map(float, bounds))
+    rng = np.random.default_rng(_SEED)
+    bodies = Bodies(robot, [(_SEED,)])
+    observed = [bodies.begin()[0]]
+    for _ in range(_MEASURED_STEPS):
+        stepped = bodies.step(_random_command(robot, rng))
+        observed.append(stepped.observation[0])
+        if stepped.ended[0]:
+            observed.append(bodies.begin()[0])
+    size = np.sqrt(np.mean(np.square(observed, dtype=np.float64), axis=0))
+    return tuple(
+        float(bound or f"{min(float(rms), 1e9):.2g}") if bound or rms > 1e-9 else 1.0
+        for bound, rms in zip(bounds, size, strict=True)
+    )
+
+
+def is_repeatable(robot: HostRobot) -> bool:
+    """Whether its seed and commands determine an episode, in a new body as in one that was used before."""
+    used, new = Bodies(robot, [(_SEED, 1)]), Bodies(robot, [(_SEED, 2)])
+    rng = np.random.default_rng(_SEED)
+    used.begin()
+    for _ in range(_REPEATED_STEPS):
+        if used.step(_random_command(robot, rng)).ended[0]:
+            break
+    again = Bodies(robot, [(_SEED, 2)])
+    # The same episode in fresh bodies and in one that has run another.
+    used.reseed([(_SEED, 2)])
+    starts = [bodies.begin() for bodies in (used, new, again)]
+    if any(not np.array_equal(start, starts[0]) for start in starts):
+        return False
+    for _ in range(_REPEATED_STEPS):
+        command = _random_command(robot, rng)
+        one, *others = (bodies.step(command) for bodies in (used, new, again))
+        if any(not np.array_equal(a, b) for other in others for a, b in zip(one, other, strict=True)):
+            return False
+        if one.ended[0]:
+            break
+    return True
+
+
+def _random_command(robot: HostRobot, rng: np.random.Generator) -> np.ndarray:
+    return rng.uniform(-1.0, 1.0, (1, robot.n_commands)).astype(np.float32)

@@ -18,10 +18,8 @@ from animat.lazy import Array, jnp
 from animat.robots.base import Robot
 
 Answer = TypeVar("Answer")
-
 PATIENCE_S = 120.0
 """How long a step of all bodies may take, or making or resetting one, before it counts as hung."""
-
 LONGEST_KEPT = 20_000
 """Longest episode, in iterations, whose commands are kept so that training can continue within it."""
 
@@ -35,12 +33,7 @@ class Body(abc.ABC):
 
     @abc.abstractmethod
     def step(self, action: Any) -> tuple[Float[np.ndarray, " observations"], float, bool, bool]:
-        """One iteration by one of the robot's `actions`.
-
-        Returns:
-            the observation, the reward in the task's own units, whether the task itself ended, and whether it was cut
-            off.
-        """
+        """One iteration by one of the robot's `actions`: observation, reward, whether the task ended or was cut off."""
 
     def picture(self) -> UInt8[np.ndarray, "height width 3"] | None:
         """The body as it is now; None if it has no picture."""
@@ -98,10 +91,7 @@ class HostRobot(Robot[Any]):
 
 
 class StepResult(NamedTuple):
-    """The result of a step of several bodies, before ended episodes restart.
-
-    A body, or the robot's `episode_limit`, may cut off an episode (`truncated`) whose task has not ended itself.
-    """
+    """The result of a step of several bodies, before ended episodes restart; a body or the limit may truncate one."""
 
     observation: Float32[np.ndarray, "bodies observations"]
     reward: Float64[np.ndarray, " bodies"]
@@ -138,11 +128,7 @@ class Snapshot(NamedTuple):
 
 
 class Bodies:
-    """Bodies of one robot side by side, each with its own sequence of episodes.
-
-    Args:
-        seeds: of each body; the seed of an episode follows from it and the episode's number.
-    """
+    """Bodies of one robot side by side; the seeds of its episodes follow from a body's seed and their numbers."""
 
     def __init__(self, robot: HostRobot, seeds: Sequence[Sequence[int]], *, with_pictures: bool = False) -> None:
         self.robot, self._seeds = robot, [tuple(seed) for seed in seeds]
@@ -178,8 +164,7 @@ class Bodies:
     def step(self, commands: Float[np.ndarray, "bodies commands"]) -> StepResult:
         """One iteration of each body; ended episodes wait for `begin`.
 
-        Raises:
-            BodyFailed: naming the robot, if a body raised, hung, or returned a number that is not finite.
+        Raises BodyFailed if a body raised, hung, or returned a number that is not finite.
         """
         robot, (observation, _, iterations, kept), bodies = self.robot, self._now, self._bodies
         actions, reward = robot.actions(commands), np.zeros(len(bodies))
@@ -257,10 +242,8 @@ class _TooLongError(BaseException):
 
 @contextmanager
 def time_limit(name: str, what: str) -> Iterator[None]:
-    """Raise BodyFailed if external code takes longer than `PATIENCE_S`, when it returns to Python.
-
-    This works only in a process's main thread, the only one to receive signals.
-    """
+    """Raise BodyFailed if external code takes longer than `PATIENCE_S`, when it returns to Python."""
+    # Only the main thread receives signals.
     if threading.current_thread() is not threading.main_thread():
         yield
         return

@@ -93,14 +93,9 @@ def places_within_reach(
 ) -> Float[np.ndarray, "places 2"]:
     """The places of a square lattice through the start to which a disc can be moved from the start.
 
-    Args:
-        start_m: initial position of the disc's centre.
-        room_m: smallest allowed distance of the centre from a wall or an obstacle.
-        spacing_m: between neighbours in the lattice, less than twice `room_m`, or the disc passes through walls; it
-            moves from a place to its four neighbours.
-
-    Returns:
-        x and y (m) of each, including the start; none without room at the start, or with over a million to check.
+    Its centre stays `room_m` or more from walls and obstacles, and moves from a place to its four neighbours. They are
+    `spacing_m` away, which must be less than twice `room_m`, or the disc passes through walls. The start is one of the
+    places; there are none without room at the start, or with over a million to check.
     """
     from scipy.ndimage import label
 

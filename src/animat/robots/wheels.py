@@ -20,18 +20,8 @@ from animat.robots.surroundings import MOST_PLACES, Obstacles, Surroundings, Wal
 
 SENSORS_DEG = (17.0, 46.0, 90.0, 151.0, -151.0, -90.0, -46.0, -17.0)
 """Directions of the e-puck's proximity sensors, IR0 to IR7, clockwise from straight ahead."""
-
-SENSORS = (
-    "right_front",
-    "right_diagonal",
-    "right_side",
-    "right_back",
-    "left_back",
-    "left_side",
-    "left_diagonal",
-    "left_front",
-)
-
+_PARTS = ("front", "diagonal", "side", "back")
+SENSORS = (*(f"right_{part}" for part in _PARTS), *(f"left_{part}" for part in reversed(_PARTS)))
 APART, SLIPPING = 0.4, 0.21
 """In body radii: the spacing of the square lattice, through the start, from which goals are drawn; and the clearance on
 such a lattice above which a robot could slip through a gap.
@@ -40,7 +30,6 @@ An iteration moves the robot by at most a radius and is checked at its end. Half
 half a radius, so at the nearest lattice place at least 0.4 / sqrt(2) less, 0.217. No wall is mistaken for a gap, as
 the lattice has a place with a clearance of at most 0.2 on one side of it.
 """
-
 ARENA = ((0.0, 0.0, 1.0, 0.0), (1.0, 0.0, 1.0, 1.0), (1.0, 1.0, 0.0, 1.0), (0.0, 1.0, 0.0, 0.0))
 """The walls of a square of 1 m."""
 

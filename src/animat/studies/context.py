@@ -17,21 +17,21 @@ from animat.coding.mapping import mapping_named
 from animat.cultures.series import SELECTION_FILE, STATE_FILE, record_series
 from animat.cultures.tissue.parameters import REVISION
 from animat.cultures.virtual import VirtualCulture
-from animat.differences import with_fingerprint
 from animat.errors import AnimatError, InvalidArgument
 from animat.evaluation.table import evaluate
 from animat.execution.jobs import Job, expect_workers
 from animat.execution.task import UNFINISHED, Task
 from animat.execution.training_task import train_alone
+from animat.folders import with_fingerprint
 from animat.neurons.timeline import fit_timeline
 from animat.progress import EqualPhases, Progress
 from animat.reality_gap import Calibration, run_policies
 from animat.recordings.reading import read_sources
 from animat.records import Positive, Seed, record, write_json
 from animat.report.results import ContextRow, LostRow
+from animat.responses.extraction import extract_series
 from animat.responses.readouts import DEFAULT_READOUTS
 from animat.responses.responses import Responses
-from animat.responses.series import extract_series
 from animat.robots.host import HostRobot
 from animat.robots.registry import robot_named
 from animat.stimulation import protocol

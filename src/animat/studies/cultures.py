@@ -20,7 +20,7 @@ from animat.execution.cluster import Cluster
 from animat.execution.gpu import find_gpu
 from animat.execution.jobs import expect_workers
 from animat.execution.pinned import PinnedProcesses, own_cores
-from animat.folder_kinds import expect_no_other
+from animat.folders import expect_no_other
 from animat.progress import Progress, Silent
 from animat.report.headline import draw_over_cultures
 from animat.report.html import Section, cell, columns_of, picture_of, table_of, write_page
@@ -65,14 +65,10 @@ def studies_of(study: Study) -> dict[str, Study]:
     """The study of each culture by the name of its folder; empty for a study of a single culture."""
     culture = study.culture
     if culture.seeds is not None:
-        return {
-            f"culture-{seed}": replace(study, culture=replace(culture, seed=seed, seeds=None))
-            for seed in read_seeds(culture.seeds)
-        }
-    return {
-        f"culture-{Path(each).name}": replace(study, culture=replace(culture, files=(each,), folders=None))
-        for each in culture.folders or ()
-    }
+        cultures = [replace(culture, seed=seed, seeds=None) for seed in read_seeds(culture.seeds)]
+    else:
+        cultures = [replace(culture, files=(each,), folders=None) for each in culture.folders or ()]
+    return {f"culture-{each.name}": replace(study, culture=each) for each in cultures}
 
 
 def run_over_cultures(

@@ -15,8 +15,7 @@ from pandas import DataFrame as DataFrame
 
 from animat.environment import Environment
 from animat.evaluation.host_rollouts import paths_on_host
-from animat.evaluation.rollouts import Actor, Episodes
-from animat.evaluation.traces import trace
+from animat.evaluation.rollouts import Actor, Episodes, trace
 from animat.goals.robot import RobotWithGoal
 from animat.neurons.simulator import NeuronSimulator
 from animat.report.results import ObjectiveMet

@@ -18,12 +18,9 @@ from animat.studies.episodes import COUPLING, RANDOM, episode_rows, record_paths
 from animat.studies.folder import TIMELINE, controls_file, episodes_file, paths_file, policies_folder
 from animat.studies.results import write_arrays
 from animat.studies.specification import Arm, RobotSpec, Study, mapping_label
-from animat.studies.task import StudyTask, draw_seed
+from animat.studies.task import StudyTask, study_seed
 from animat.studies.training import training_of
 from animat.training.policy import Policy
-
-_SEED_NAMES = {"heuristic": "made by hand"}
-"""Former names of renamed controls, from which their seeds are still made, so that a seed's results do not change."""
 
 
 @final
@@ -43,15 +40,15 @@ class Evaluate(StudyTask):
         robot, slug = self.spec.name, self.arm.slug
         parts = []
         for at_min, episodes in study.minutes_of(self.arm, first, last).items():
-            ran = setting.run(networks, at_min, episodes, draw_seed(study.seed, robot, slug, at_min))
+            ran = setting.run(networks, at_min, episodes, study_seed(study, robot, slug, at_min))
             parts.append(episode_rows(ran, robot=robot, arm=self.arm.name, at_min=at_min))
         if self.arm.through_neurons and timeline is not None:
             for i, at_min in enumerate(timeline.start_min.tolist()):
                 progress.update(i, len(timeline), "over time")
-                seed = draw_seed(study.seed, robot, slug, at_min, "over time")
+                seed = study_seed(study, robot, slug, at_min, "over time")
                 ran = setting.run(networks, at_min, study.episodes_over_time, seed)
                 parts.append(episode_rows(ran, robot=robot, arm=self.arm.name, at_min=at_min, over_time=True))
-        seed = draw_seed(study.seed, robot, slug, last, "paths")
+        seed = study_seed(study, robot, slug, last, "paths")
         paths = record_paths(setting.environment, setting.simulator(last), networks, seed)
         return [
             write_episodes(episodes_file(folder, self.spec, self.arm), parts),
@@ -86,18 +83,18 @@ class Control(StudyTask):
             progress.update(i, len(minutes), f"at {at_min:g} min")
             simulator = setting.simulator(at_min)
             for each in controls_of(setting.environment, simulator, setting.action_labels, networks):
-                seed = draw_seed(study.seed, robot, name, at_min, _SEED_NAMES.get(each.name, each.name))
+                seed = study_seed(study, robot, name, at_min, each.name)
                 ran = each.run(setting.environment, simulator, episodes=study.episodes, seed=seed)
                 parts.append(episode_rows(ran, robot=robot, arm=through, at_min=at_min, agent=each.name))
         if timeline is not None and arm.through_neurons:
             if networks is not None and not isinstance(setting.environment.robot, HostRobot):
                 progress.update(len(minutes), len(minutes) + 1, "best coupling")
-                seeds = [draw_seed(study.seed, robot, name, last, COUPLING, part) for part in ("search", "episodes")]
+                seeds = [study_seed(study, robot, name, last, COUPLING, part) for part in ("search", "episodes")]
                 coupling = best_coupling(setting.environment, setting.simulator(last), seed=seeds[0])
                 ran = setting.run(coupling, last, study.episodes, seeds[1])
                 parts.append(episode_rows(ran, robot=robot, arm=through, at_min=last, agent=COUPLING))
             for at_min in timeline.start_min.tolist():
-                seed = draw_seed(study.seed, robot, name, at_min, "over time")
+                seed = study_seed(study, robot, name, at_min, "over time")
                 ran = setting.run(Uniform(), at_min, study.episodes, seed)
                 parts.append(episode_rows(ran, robot=robot, arm=through, at_min=at_min, agent=RANDOM, over_time=True))
         return [write_episodes(controls_file(folder, self.spec, arm), parts)]

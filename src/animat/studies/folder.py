@@ -10,10 +10,10 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from animat.differences import first_difference, folder_mismatch, read_description, with_fingerprint
 from animat.errors import InvalidArgument, Mismatch, as_invalid_file
 from animat.execution.receipts import sha256
 from animat.execution.task import NOTICES, UNFINISHED
+from animat.folders import first_difference, folder_mismatch, read_description, with_fingerprint
 from animat.goals.robot import without_goal
 from animat.plain_file import expect_no_file, expect_plain_file
 from animat.recordings.formats.csv import stimuli_beside
@@ -57,7 +57,7 @@ def describe_study(study: Study, sources: dict[str, str], device: str | None = N
             "sources": sources,
             # Another version may round differently, or draw other figures.
             "versions": versions,
-            "seeds": {"culture": study.culture.seed, "training and evaluation": study.seed},
+            "seeds": {"culture": study.culture.seed, "training and evaluation, with the culture's name": study.seed},
         }
     )
 

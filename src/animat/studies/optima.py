@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any, final
 
 from animat.environment import Animat
+from animat.evaluation.optimal_returns import WellSampled, undersampled
 from animat.evaluation.optimum import Case, Optimum, best_returns
-from animat.evaluation.resampling import WellSampled, undersampled
 from animat.neurons.timeline import SimulatorTimeline
 from animat.progress import Part, Progress
 from animat.report.results import StudyOptimum

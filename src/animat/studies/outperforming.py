@@ -7,8 +7,7 @@ from math import nan
 
 from animat.evaluation.coupling import REFLEX_GAP, context_gap
 from animat.evaluation.optimum import Optimum
-from animat.evaluation.statistics import Interval
-from animat.evaluation.verdict import compare_episodes, is_worse
+from animat.evaluation.statistics import Interval, compare_episodes, is_worse
 from animat.report.results import HeuristicComparison, ReflexComparison, Results, StudyOptimum
 from animat.studies.episodes import COUPLING, POLICY, RANDOM, DataFrame, mean_returns, rows_where
 from animat.studies.evaluating import is_usual

@@ -16,9 +16,9 @@ from animat.progress import Progress
 from animat.recordings.findings import Finding
 from animat.recordings.formats.nwb import recording_name, write_nwb
 from animat.recordings.reading import read_recordings
+from animat.responses.extraction import extract_series
 from animat.responses.readouts import ALL, readouts_named
 from animat.responses.responses import Responses
-from animat.responses.series import extract_series
 from animat.studies.folder import RECEIPTS, RECORDINGS, RESPONSES, TIMELINE, source_files
 from animat.studies.results import write_table
 from animat.studies.specification import Study

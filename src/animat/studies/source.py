@@ -82,6 +82,11 @@ class Source:
         if self.kind == "virtual":
             self.protocol()
 
+    @property
+    def name(self) -> str:
+        """The culture's seed, or the names of its files, without their folders."""
+        return str(self.seed) if self.kind == "virtual" else ", ".join(Path(file).name for file in self.files)
+
     def protocol(self) -> Protocol:
         """The protocol of each recording of a virtual culture; raises InvalidArgument if it is invalid."""
         places: dict[str, Any] = {} if self.places is None else {"places": self.places}

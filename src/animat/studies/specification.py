@@ -78,7 +78,7 @@ class Simulators:
     def __post_init__(self) -> None:
         from animat.neurons.simulator import check_binning
         from animat.responses.conditions import conditions_named
-        from animat.responses.series import check_allowed
+        from animat.responses.extraction import check_allowed
         from animat.responses.windows import check_window
 
         # Checked before anything is recorded, as a later correction would need another folder.
@@ -101,7 +101,7 @@ class RobotSpec:
         iterations: of training, for each policy; None: the paper's.
         parameters: that replace its defaults, such as `pole_mass_kg`.
         optimum_resolution: of its optimal return; replaces the study's.
-        goal: that replaces its own task (`animat.goals.text`); None: its own task.
+        goal: that replaces its own task (`animat.goals.goal`); None: its own task.
         lessons: taught to its policies in turn, each a table `[[robots.lessons]]` (`animat.training.lessons`).
     """
 

@@ -15,8 +15,13 @@ from animat.studies.specification import Study
 
 
 def draw_seed(*names: object) -> int:
-    """A seed derived from the names of what is drawn, so that no two arms share random numbers."""
+    """A seed derived from the names of what is drawn."""
     return int.from_bytes(hashlib.sha256(repr(names).encode()).digest()[:4], "big") >> 1
+
+
+def study_seed(study: Study, *names: object) -> int:
+    """A seed for what a study draws; none share random numbers, as tests take arms and cultures for independent."""
+    return draw_seed(study.seed, study.culture.name, *names)
 
 
 @dataclass(frozen=True)

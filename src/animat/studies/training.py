@@ -14,7 +14,7 @@ from animat.neurons.timeline import SimulatorTimeline, load_timeline
 from animat.progress import Progress
 from animat.studies.folder import TIMELINE, policies_folder
 from animat.studies.specification import Arm, RobotSpec, Study
-from animat.studies.task import StudyTask, draw_seed
+from animat.studies.task import StudyTask, study_seed
 from animat.training.folder import describe, provenance_of
 from animat.training.group import Group, untrained_policies
 from animat.training.settings import SAC
@@ -64,8 +64,7 @@ def training_of(study: Study, spec: RobotSpec, arm: Arm) -> Training:
         mapping=mapping_named(arm.mapping) if through_neurons else None,
         policies=study.policies,
         iterations=spec.trained_for,
-        # Rank tests assume that the policies of two arms are independent, so arms have different seeds.
-        seed=draw_seed("training", study.seed, spec.name, arm.slug),
+        seed=study_seed(study, "training", spec.name, arm.slug),
         shadowing=arm.shadowing if through_neurons else bool(arm.shadowing),
         duration_min=study.training_min,
         percentiles=arm.percentiles,

@@ -12,9 +12,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Float64, Int64, PRNGKeyArray
 
 from animat.compilation import jit_side_by_side
-from animat.environment import Environment
+from animat.environment import Environment, Neurons
 from animat.errors import InvalidArgument
-from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import SimulatorTimeline
 from animat.training.lessons import Lesson, stages_of
 from animat.training.networks import Network, likeliest_action
@@ -29,12 +28,9 @@ ASSESSED = ("iterations", "minute", "lesson", "success", "mean_return")
 
 
 def assess(
-    environment: Varied[Any], episodes: int, actor: Network, simulator: NeuronSimulator | None, key: PRNGKeyArray
+    environment: Varied[Any], episodes: int, actor: Network, simulator: Neurons, key: PRNGKeyArray
 ) -> tuple[Float[Array, " episodes"], Bool[Array, " episodes"]]:
-    """The return of each episode of a policy's most probable actions, and whether it succeeded.
-
-    With the same key in each assessment of a training, its policies and minutes are comparable.
-    """
+    """The return of each episode of a policy's most probable actions, and whether it succeeded."""
     limited = EpisodeLimit(environment)
     start_key, iteration_key = jax.random.split(key)
     started = jax.vmap(limited.reset)(jax.random.split(start_key, episodes)).carried
@@ -103,10 +99,10 @@ def programs_with_ranges(
     def beginning(ranges: Ranges, key: Any) -> Learner:
         return begin(EpisodeLimit(varied(ranges)), algorithm, key)
 
-    def chunk(ranges: Ranges, learner: Learner, simulator: NeuronSimulator | None, first: Any, last: Any) -> Any:
+    def chunk(ranges: Ranges, learner: Learner, simulator: Neurons, first: Any, last: Any) -> Any:
         return train_chunk(EpisodeLimit(varied(ranges)), algorithm, learner, simulator, first, last)
 
-    def assessment(ranges: Ranges, actor: Network, simulator: NeuronSimulator | None, key: Any) -> Any:
+    def assessment(ranges: Ranges, actor: Network, simulator: Neurons, key: Any) -> Any:
         return assess(varied(ranges), episodes, actor, simulator, key)
 
     return (
@@ -146,7 +142,7 @@ class Course:
     def train(self, learners: Learner, *arguments: Any) -> Any:
         return self._programs[1](self.ranges, learners, *arguments)
 
-    def assess(self, index: int, deployed: Network, simulator: NeuronSimulator | None) -> None:
+    def assess(self, index: int, deployed: Network, simulator: Neurons) -> None:
         """At the end of a chunk: assess the policies, keep the best so far, and move them on to the next lesson."""
         training, (lesson, table, best, best_at, score) = self._training, self.state
         if not training.episodes_assessed:
@@ -174,8 +170,9 @@ class Course:
             np.where(is_best[:, None], new_score, score),
         )
 
-    def _scores(self, networks: Network, simulator: NeuronSimulator | None) -> Float64[np.ndarray, "policies 2"]:
+    def _scores(self, networks: Network, simulator: Neurons) -> Float64[np.ndarray, "policies 2"]:
         """Each policy's share of successes (NaN for a robot that does not report success) and mean return."""
+        # The same in each assessment of a training, so that its policies and minutes are comparable.
         key = jax.random.fold_in(jax.random.key(self._training.seed), MOST_POLICIES)
         returns, succeeded = map(np.asarray, self._programs[2](self.ranges, networks, simulator, key))
         success = np.where(hasattr(self._training.robot, "succeeded"), succeeded.mean(axis=1), np.nan)

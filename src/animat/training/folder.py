@@ -15,9 +15,8 @@ import numpy as np
 
 from animat.coding.checking import check_mapping
 from animat.coding.mapping import REGISTRY as MAPPINGS
-from animat.differences import first_difference, folder_mismatch, read_description, with_fingerprint
 from animat.errors import InvalidArgument, Mismatch
-from animat.folder_kinds import expect_no_other
+from animat.folders import expect_no_other, first_difference, folder_mismatch, read_description, with_fingerprint
 from animat.goals.robot import without_goal
 from animat.neurons.timeline import SimulatorTimeline
 from animat.plain_file import expect_no_file

@@ -16,19 +16,17 @@ import numpy as np
 from jaxtyping import Float64
 
 from animat.compilation import jit_side_by_side
-from animat.environment import Environment
+from animat.environment import Environment, Neurons
 from animat.errors import InvalidFile, UnusableData
-from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import SimulatorTimeline
 from animat.progress import Progress
 from animat.responses.readouts import ALL
 from animat.robots.host import HostRobot
 from animat.training.course import Course
-from animat.training.diagnosis import Diagnosis, diagnosis_program
 from animat.training.host import OnHost
 from animat.training.networks import Network
 from animat.training.policy import CURVE, Policy
-from animat.training.sac import begin, train_chunk
+from animat.training.sac import Diagnosis, begin, diagnosis_program, train_chunk
 from animat.training.settings import SAC
 from animat.training.specification import CHUNKS, Training
 from animat.wrappers import EpisodeLimit
@@ -39,7 +37,6 @@ BEST = "best"
 CHECKPOINT_S = 2.0
 """Seconds of training that a kill may cost; a checkpoint of five policies is 30 MB and takes about 50 ms."""
 
-
 Rows = TypeVar("Rows", list[Policy], np.ndarray)
 Chunk: TypeAlias = Float64[np.ndarray, "policies columns"]
 """One chunk of the learning curves, one row per policy; columns as `CURVE`."""
@@ -48,10 +45,7 @@ AddChunk: TypeAlias = Callable[[Chunk], None]
 
 @dataclass(frozen=True, eq=False)
 class Group:
-    """Some of a training's policies, by their numbers, and the simulators they are trained on.
-
-    A checkpoint with another fingerprint is refused. The provenance is stored in the policies.
-    """
+    """Some of a training's policies, by their numbers, and the simulators they are trained on."""
 
     training: Training
     members: tuple[int, ...]
@@ -75,7 +69,7 @@ def train_groups(
     at once changes the last bits.
 
     Args:
-        groups: groups that one program can train (`animat.execution.gpu.group_by_program`).
+        groups: that one program can train (`animat.execution.gpu.group_by_program`).
         checkpoint: file written atomically from time to time; the caller removes it when it is no longer needed.
         progress: updated after each chunk with the number done and the mean return of the episodes that ended in it.
         checkpoint_s: seconds between checkpoints; they change how much is repeated, never the result.
@@ -109,7 +103,7 @@ def train_groups(
     return together.split(together.policies())
 
 
-def _simulators_of(group: Group) -> Callable[[int], NeuronSimulator | None]:
+def _simulators_of(group: Group) -> Callable[[int], Neurons]:
     """The simulator of a group in each chunk, by its number; all simulators where each episode draws one."""
     training = group.training
     if group.timeline is None:
@@ -192,13 +186,11 @@ class SideBySide:
         ends = np.cumsum([len(group.members) for group in self._groups])
         return [rows[end - len(group.members) : end] for group, end in zip(self._groups, ends, strict=True)]
 
-    def train(self, index: int, *simulators: NeuronSimulator | None) -> float:
+    def train(self, index: int, *simulators: Neurons) -> float:
         """Train one chunk with the simulator of each group; `index` counts from 0, also beyond those of the training.
 
-        Returns the mean return of the episodes that ended in it, NaN if none ended.
-
-        Raises:
-            UnusableData: if policies that are diagnosed are no longer finite.
+        Returns the mean return of the episodes that ended in it, NaN if none ended. Raises UnusableData if policies
+        that are diagnosed are no longer finite.
         """
         training, simulator = self._groups[0].training, simulators[0]
         algorithm = training.algorithm

@@ -16,9 +16,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from animat.compilation import jit_side_by_side
-from animat.environment import Environment
+from animat.environment import Environment, Neurons
 from animat.neurons.history import INITIAL_HISTORY
-from animat.neurons.simulator import NeuronSimulator
 from animat.robots.host import Bodies, HostRobot, Snapshot
 from animat.training.replay import pack_transitions
 from animat.training.sac import Finished, Learner, begin, choose_actions, critic_state, end_round, learn, uniform_shapes
@@ -35,9 +34,7 @@ class Actions(NamedTuple):
     cost: Float[Array, " environments"] | None = None
 
 
-def act(
-    environment: Environment[Any], settings: SAC, learner: Learner, simulator: NeuronSimulator | None
-) -> tuple[Learner, Actions]:
+def act(environment: Environment[Any], settings: SAC, learner: Learner, simulator: Neurons) -> tuple[Learner, Actions]:
     """The actions of a round; arguments as in `animat.training.sac.train_chunk`."""
     key, use = jax.random.split(learner.key)
     acting, _ = uniform_shapes(environment, settings)
@@ -50,7 +47,7 @@ def learn_and_act(
     learner: Learner,
     acted: Actions,
     moved: tuple[Any, Array],
-    simulator: NeuronSimulator | None,
+    simulator: Neurons,
     index: Int[Array, ""],
 ) -> tuple[Learner, Actions, Finished]:
     """Store a round, learn from the replay, and act in the next round.
@@ -85,7 +82,7 @@ def learn_and_act(
 
 
 def _act(
-    environment: Environment[Any], learner: Learner, simulator: NeuronSimulator | None, uniforms: Array
+    environment: Environment[Any], learner: Learner, simulator: Neurons, uniforms: Array
 ) -> tuple[Learner, Actions]:
     observation = jax.vmap(environment.observe)(learner.episodes) / environment.scales
     learner, action, noise = choose_actions(environment, learner, observation, uniforms)
@@ -129,7 +126,7 @@ class OnHost:
         return learners._replace(episodes=learners.episodes._replace(robot=self._by_policy(none)))
 
     def train(
-        self, learners: Learner, simulator: NeuronSimulator | None, first_round: Array, last_round: Array
+        self, learners: Learner, simulator: Neurons, first_round: Array, last_round: Array
     ) -> tuple[Learner, Finished]:
         members = len(learners.returns)
         finished = Finished(np.zeros(members), np.zeros(members))  # type: ignore[arg-type]

@@ -42,8 +42,6 @@ class Lesson:
     """Ranges from which each episode is drawn; whatever is not named keeps the value of the robot and its reset.
 
     Attributes:
-        name: for people.
-        parameters: ranges of the robot's parameters, by name.
         starts: ranges of numbers of the robot's state at the start of an episode, by name.
         recordings_min: minutes of the culture's clock, inclusive, between which the recordings started from which an
             episode's simulator is drawn, if it is (`Training.shadowing`); None: all.

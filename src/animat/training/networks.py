@@ -75,10 +75,7 @@ def draw_action(
     observation: Float[Array, "batch observations"],
     uniforms: Float[Array, "batch drawn"],
 ) -> Array:
-    """Draw an action from the policy for each scaled observation, by inverse transform sampling.
-
-    Returns shape (batch,), or (batch, commands) for several continuous commands.
-    """
+    """Draw an action from the policy for each scaled observation, by inverse transform sampling."""
     outputs = forward(actor, observation)
     if environment.n_actions is None:
         return as_commands(environment, squashed_normal(outputs, uniforms)[0])

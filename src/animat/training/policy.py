@@ -42,7 +42,7 @@ HIDDEN_ACTIVATION = "relu"
 """Activation of both hidden layers, max(0, x); stored in every file for users without this package."""
 CURVE = ("iterations", "episodes", "mean_return", "entropy", "alpha", "critic_loss")
 """The columns of a learning curve, one row per chunk: iterations done at its end, the episodes that ended in it, their
-mean return, and the learner's diagnosis at its end (`animat.training.diagnosis`); NaN: unknown."""
+mean return, and the learner's diagnosis at its end (`animat.training.sac`); NaN: unknown."""
 _LAYERS = 3
 _ARRAYS = ("scales", "learning_curve", *(f"layer{i}.{part}" for i in range(_LAYERS) for part in ("weight", "bias")))
 _MOST_BYTES = 2**28
@@ -199,8 +199,7 @@ class Policy:
     def outputs(self, observation: Float[np.ndarray, " observations"]) -> Float32[np.ndarray, " outputs"]:
         """The network's outputs for an observation in physical units.
 
-        Raises:
-            InvalidArgument: for an observation of the wrong shape; NaN is not checked.
+        Raises InvalidArgument for one of the wrong shape; NaN is not checked.
         """
         shape = self.scales.shape
         # An array's attribute comes first, as reading it takes only a hundredth of a decision's time.
@@ -227,8 +226,7 @@ class Policy:
         """Draw an action from the policy: the index of a condition (or command), or a continuous command.
 
         Args:
-            observation: the observation in physical units, shape (observations,).
-            rng: source of random numbers.
+            observation: in physical units, shape (observations,).
         """
         if self.n_actions is None:
             mean, log_std = np.split(self.outputs(observation).astype(np.float64), 2)

@@ -1,4 +1,4 @@
-"""The whole of Soft Actor-Critic: networks, replay, losses, and the loop of acting and learning, as one jittable chunk.
+"""The whole of Soft Actor-Critic: losses, the loop of acting and learning as one jittable chunk, and its diagnosis.
 
 Discrete actions after Christodoulou (2019, arXiv:1910.07207), continuous ones after Haarnoja et al. (2018,
 arXiv:1812.05905), with two critics, slowly moving target critics, and an entropy bonus whose weight alpha is learned so
@@ -17,6 +17,8 @@ transition is one packed row; the random numbers of a round are one block.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -24,14 +26,17 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from animat.environment import Environment, State
-from animat.neurons.simulator import NeuronSimulator
+from animat.compilation import jit_side_by_side
+from animat.environment import Environment, Neurons, State
 from animat.robots.base import Robot
 from animat.training.exploration import Exploration, count_ended, entropy_factor, explore, n_uniforms, nothing_held
 from animat.training.networks import Network, draw_action, forward, initial_networks, squashed_normal
 from animat.training.replay import Batch, draw_batch, pack_transitions, remember
 from animat.training.settings import SAC
 from animat.wrappers import EpisodeLimit, net_return, net_reward
+
+_TRANSITIONS = 512
+"""Number of transitions drawn for a diagnosis, which then takes less than 1 % of a chunk of the usual length."""
 
 
 class Parameters(NamedTuple):
@@ -65,9 +70,6 @@ class Finished(NamedTuple):
 
     episodes: Float[Array, ""]
     returns: Float[Array, ""]
-
-
-# --- losses ---------------------------------------------------------------------------------------------------------
 
 
 def discrete_losses(
@@ -138,9 +140,6 @@ def continuous_losses(
     return critic_loss, actor_loss, alpha_loss
 
 
-# --- acting and learning --------------------------------------------------------------------------------------------
-
-
 def begin(environment: EpisodeLimit[Any], settings: SAC, key: PRNGKeyArray) -> Learner:
     """A new, untrained policy; every random draw of its training follows from `key`."""
     weight_key, reset_key, key = jax.random.split(key, 3)
@@ -168,19 +167,14 @@ def train_chunk(
     environment: EpisodeLimit[Any],
     settings: SAC,
     learner: Learner,
-    simulator: NeuronSimulator | None,
+    simulator: Neurons,
     first_round: Int[Array, ""],
     last_round: Int[Array, ""],
 ) -> tuple[Learner, Finished]:
     """Act and learn for some rounds with one simulator; in a round every environment does one iteration.
 
-    Args:
-        environment: the environment that the policy acts in (static).
-        settings: settings of the algorithm (static).
-        learner: the policy under training.
-        simulator: the simulator of the neurons during this chunk; None without neurons.
-        first_round, last_round: the rounds of the chunk, from the first up to but excluding the last; the same for all
-            policies that are trained side by side.
+    Environment and settings are static. The rounds are those from the first up to but excluding the last, the same for
+    all policies that are trained side by side.
     """
     acting, learning = uniform_shapes(environment, settings)
     n_acting = math.prod(acting)
@@ -230,9 +224,6 @@ def shaped(
 
     with d for ended (terminated or truncated), as in the losses. Over any episode the discounted terms add up to
     -potential(s_0), regardless of the actions (Ng, Harada & Russell 1999). Reported returns do not include them.
-
-    Args:
-        before, after: states of the robot, with an axis of environments.
     """
     if not hasattr(robot, "potential"):
         return reward
@@ -329,3 +320,39 @@ def _adam(settings: SAC) -> optax.GradientTransformation:
     # Before any reward is found, gradients are almost 0. With a smaller epsilon Adam turns their noise into full steps,
     # which in one navigation policy of twenty permanently switched off every unit of the second layer.
     return optax.flatten(optax.adam(settings.learning_rate, eps=1e-5))
+
+
+class Diagnosis(NamedTuple):
+    """The diagnosis of one policy, on transitions drawn from its replay, to explain its learning curve.
+
+    Attributes:
+        entropy: mean of H(pi(.|o)), nats; for continuous actions the mean of -log pi(a|o), one action drawn per state.
+    """
+
+    entropy: Float[Array, ""]
+    alpha: Float[Array, ""]
+    critic_loss: Float[Array, ""]
+
+
+def diagnose(environment: Environment[Any], settings: SAC, learner: Learner, available: Int[Array, ""]) -> Diagnosis:
+    """Diagnose a learner, always with the same random numbers; NaN if its replay has no transitions available."""
+    n_drawn = environment.n_drawn
+    uniforms = jax.random.uniform(jax.random.key(0), (1 + 2 * n_drawn, _TRANSITIONS))
+    batch = draw_batch(environment, learner.replay, available, uniforms[0])
+    noise = uniforms[1:].reshape(2, n_drawn, _TRANSITIONS).swapaxes(1, 2)
+    outputs = forward(learner.trained.actor, batch.observation)
+    paid = entropy_factor(learner.exploration)
+    if environment.n_actions is None:
+        critic_loss, _, _ = continuous_losses(learner.trained, learner.targets, batch, noise, settings, paid)
+        _, log_pi = squashed_normal(outputs, noise[1])
+    else:
+        critic_loss, _, _ = discrete_losses(learner.trained, learner.targets, batch, settings, paid)
+        log_pi = jnp.sum(jax.nn.softmax(outputs) * jax.nn.log_softmax(outputs), axis=-1)
+    numbers = -jnp.mean(log_pi), jnp.exp(learner.trained.log_alpha), critic_loss
+    return Diagnosis(*(jnp.where(available > 0, number, jnp.nan) for number in numbers))
+
+
+@lru_cache(maxsize=8)
+def diagnosis_program(environment: Environment[Any], algorithm: SAC) -> Callable[..., Any]:
+    """`diagnose` for several policies, compiled when it is first called."""
+    return jit_side_by_side(partial(diagnose, environment, algorithm), (0, None))

@@ -32,7 +32,6 @@ Shadowing = bool | Literal["drawn"]
 CHUNKS = 60
 """Number of chunks in a training: the units of progress, refresh and checkpoint; a culture minute each by default."""
 
-
 T = TypeVar("T")
 
 
@@ -201,8 +200,7 @@ class Training:
     def environment_on(self, timeline: SimulatorTimeline | None) -> Environment[Any]:
         """The environment for a culture's simulators, including the costs of trials, if any.
 
-        Raises:
-            UnusableData: for a pulse cost with conditions whose electrodes are unknown.
+        Raises UnusableData for a pulse cost with conditions whose electrodes are unknown.
         """
         environment = self.environment(0 if timeline is None else len(timeline.conditions))
         if timeline is None or not self.pulse_cost:

@@ -17,10 +17,10 @@ import numpy as np
 from jax.errors import JAXTypeError
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from animat.environment import Environment, Responded, RobotState, State, Uniforms
+from animat.environment import Environment, Neurons, Responded, RobotState, State, Uniforms
 from animat.errors import InvalidArgument, did_you_mean, first_line
 from animat.goals.robot import RobotWithGoal, without_goal
-from animat.neurons.simulator import NeuronSimulator, Stored
+from animat.neurons.simulator import Stored
 from animat.robots.base import Robot
 from animat.training.lessons import Lesson
 from animat.wrappers import Wrapper, replace_innermost
@@ -87,10 +87,10 @@ class Varied(Wrapper[RobotState]):
     def observe(self, state: State) -> Float[Array, " observations"]:
         return self._in(state).observe(state)
 
-    def respond(self, uniforms: Uniforms, state: State, action: Array, simulator: NeuronSimulator | None) -> Responded:
+    def respond(self, uniforms: Uniforms, state: State, action: Array, simulator: Neurons) -> Responded:
         return self._in(state).respond(uniforms, state, action, self._drawn(state, simulator))
 
-    def advance(self, uniforms: Uniforms, state: State, action: Array, simulator: NeuronSimulator | None) -> State:
+    def advance(self, uniforms: Uniforms, state: State, action: Array, simulator: Neurons) -> State:
         return self._in(state).advance(uniforms, state, action, self._drawn(state, simulator))
 
     def succeeded(self, state: State) -> Bool[Array, ""]:
@@ -108,7 +108,7 @@ class Varied(Wrapper[RobotState]):
         varied = with_parameters(self.robot, values)
         return replace_innermost(self.inside, lambda inmost: dataclasses.replace(inmost, robot=varied))  # type: ignore[type-var]
 
-    def _drawn(self, state: State, simulator: NeuronSimulator | None) -> NeuronSimulator | None:
+    def _drawn(self, state: State, simulator: Neurons) -> Neurons:
         if not self.varying.recordings:
             return simulator
         row = state.info["recording"]
@@ -130,7 +130,8 @@ def with_parameters(robot: Kind, values: Mapping[str, Any]) -> Kind:
 def expect_varied(robot: Robot[Any], varying: Varying) -> None:
     """Refuse what cannot vary in this robot, by tracing it."""
     state = jax.eval_shape(without_goal(robot).reset, jax.random.key(0))
-    known = [name for name in getattr(state, "_fields", ()) if _is_number(getattr(state, name))]
+    leaves = {name: getattr(state, name) for name in getattr(state, "_fields", ())}
+    known = [n for n, x in leaves.items() if getattr(x, "shape", None) == () and jnp.issubdtype(x.dtype, jnp.floating)]
     for name in varying.starts:
         if name not in known:
             near = did_you_mean(name, known) or f"; there are {', '.join(known) or 'none'}"
@@ -159,10 +160,6 @@ def _started(robot: Robot[Any], state: Any, drawn: Mapping[str, Array]) -> Any:
     body = state.robot if isinstance(robot, RobotWithGoal) else state
     body = body._replace(**{n: jnp.where(jnp.isnan(value), getattr(body, n), value) for n, value in drawn.items()})
     return robot.started(body) if isinstance(robot, RobotWithGoal) else body
-
-
-def _is_number(leaf: Any) -> bool:
-    return getattr(leaf, "shape", None) == () and jnp.issubdtype(leaf.dtype, jnp.floating)
 
 
 def _between(key: PRNGKeyArray, ends: Float[Stored, "2 numbers"]) -> Float[Array, " numbers"]:

@@ -1,10 +1,12 @@
-"""The page's requests: its own files, the list of items to watch, and each view."""
+"""The page's requests: who may ask, and the answers: its own files, the list of items to watch, and each view."""
 
 from __future__ import annotations
 
+import hmac
 import threading
+import time
 from collections import OrderedDict
-from collections.abc import Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -12,9 +14,9 @@ from typing import Any
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
 from starlette.middleware import Middleware
-from starlette.middleware.base import BaseHTTPMiddleware
+from starlette.middleware.base import BaseHTTPMiddleware, RequestResponseEndpoint
 from starlette.requests import Request
-from starlette.responses import JSONResponse, Response
+from starlette.responses import JSONResponse, PlainTextResponse, Response
 from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket
@@ -22,7 +24,6 @@ from starlette.websockets import WebSocket
 from animat.errors import AnimatError, InvalidArgument, first_line
 from animat.watch.cultures import CulturesView
 from animat.watch.discovery import find, place_within
-from animat.watch.guard import guard
 from animat.watch.plain import text
 from animat.watch.recording import RecordingView
 from animat.watch.session import SessionView, stop_session
@@ -34,14 +35,24 @@ from animat.watch.view import View
 _MOST_VIEWS = 8
 """Most views kept open."""
 _VIEWS: dict[str, type[View]] = {
-    "session": SessionView,
-    "training": TrainingView,
-    "study": StudyView,
-    "cultures": CulturesView,
-    "tuning": TuningView,
-    "recording": RecordingView,
+    view.kind: view for view in (SessionView, TrainingView, StudyView, CulturesView, TuningView, RecordingView)
 }
 _Query = Mapping[str, str]
+
+_POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; "
+    "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
+"""The page may load only its own files and responses."""
+_HEADERS = {
+    "content-security-policy": _POLICY,
+    "x-content-type-options": "nosniff",
+    "referrer-policy": "no-referrer",
+    "cross-origin-opener-policy": "same-origin",
+    "cross-origin-resource-policy": "same-origin",
+    "cache-control": "no-store",
+}
+"""Headers of every response."""
 
 
 class Watched:
@@ -117,7 +128,7 @@ def app_for(folder: Path, token: str, port: int) -> Starlette:
         WebSocketRoute("/{path:path}", refuse),
         Mount("/", StaticFiles(packages=[("animat.watch", "page")], html=True)),
     ]
-    guarded = Middleware(BaseHTTPMiddleware, dispatch=guard(token, port))
+    guarded = Middleware(BaseHTTPMiddleware, dispatch=_guard(token, port))
     return Starlette(routes=[Mount(f"/{token}", routes=routes)], middleware=[guarded])
 
 
@@ -139,3 +150,39 @@ def _number(query: _Query, name: str) -> float | None:
         if abs(value := float(query[name])) < 1e15:
             return value
     raise InvalidArgument(f"{name}: expected a number, got {text(query[name], 40)}")
+
+
+def _guard(token: str, port: int) -> Callable[[Request, RequestResponseEndpoint], Awaitable[Response]]:
+    """Middleware that answers 403 to any request that is not from the page or its address, and passes on the rest.
+
+    A foreign name that resolves to this machine (DNS rebinding) appears in `Host`, a foreign page in `Origin`. Neither
+    knows the token that begins every path. The time of the last request that was passed on is kept in
+    the application's `state.asked_s`.
+    """
+    hosts = {f"{name}:{port}" for name in ("127.0.0.1", "localhost")}
+    origins = {f"http://{host}" for host in hosts}
+
+    def refusal(request: Request) -> str:
+        """Why a request is refused; empty if it is not."""
+        host, origin = (request.headers.getlist(name) for name in ("host", "origin"))
+        if len(host) != 1 or host[0] not in hosts:
+            return "this page is only for this machine, at the printed address"
+        if len(origin) > 1 or any(page not in origins for page in origin):
+            return "requests from other pages are refused"
+        if request.method not in ("GET", "HEAD") and not origin:
+            return "expected an Origin with a request that changes something"
+        prefix, slash, _ = request.scope["path"].removeprefix("/").partition("/")
+        if not slash or not hmac.compare_digest(prefix.encode("utf-8", "replace"), token.encode()):
+            return "expected the token of the printed address"
+        return ""
+
+    async def guarded(request: Request, answer: RequestResponseEndpoint) -> Response:
+        if reason := refusal(request):
+            response: Response = PlainTextResponse(reason, 403)
+        else:
+            request.app.state.asked_s = time.monotonic()
+            response = await answer(request)
+        response.headers.update(_HEADERS)
+        return response
+
+    return guarded

@@ -9,12 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from animat.errors import InvalidFile
-from animat.watch.blocks import Width, facts, table, time_left
+from animat.watch.discovery import is_locked, state_of
 from animat.watch.files import json_of, text_of
 from animat.watch.plain import listed, mapped, text
-from animat.watch.state import is_locked, state_of
 from animat.watch.study import share_of
-from animat.watch.view import View, in_blocks
+from animat.watch.view import View, Width, facts, in_blocks, table, time_left
 
 _DONE, _COMPARISONS = "jobs/report.json", "tables/comparisons.csv"
 _MOST_CULTURES, _MOST_BYTES = 10_000, 2**20

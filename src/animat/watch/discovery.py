@@ -1,23 +1,29 @@
-"""Find items to watch in a folder: sessions, trainings, studies, tunings and recordings."""
+"""What is in a folder to watch, such as sessions, trainings and recordings, and whether a program is working there."""
 
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 from animat.closed_loop.session_data import LOG_FILE
 from animat.cultures.under_way import UNDER_WAY
 from animat.errors import InvalidArgument
-from animat.folder_kinds import MARKERS, Kind
-from animat.watch.state import changed_s
+from animat.execution.task import UNFINISHED
+from animat.folders import MARKERS, Kind
+from animat.writing import LOCK
 
 _MARKS = {kind: names[0] for kind, names in MARKERS.items() if kind not in ("recording", "live")}
 """The file that identifies each kind."""
 _DEPTH, _MOST_FOLDERS, _MOST_ITEMS, _MOST_RECORDINGS = 4, 4000, 2000, 500
 _SKIPPED = ("jobs", "figures", "tables", "checkpoints")
+_LOCKS = Path("/proc/locks")
+_SILENT_S = 60.0
+"""If locks cannot be looked up, a folder without a change for this long counts as idle."""
 
 
 @dataclass(frozen=True)
@@ -30,10 +36,7 @@ class Item:
 
 
 def find(folder: Path) -> list[Item]:
-    """The items in a folder and its subfolders, newest first, without links.
-
-    A folder that does not exist yet holds none.
-    """
+    """The items in a folder, which need not exist yet, and its subfolders, newest first, without links."""
     items = [item for subfolder in _folders(folder) for item in _in_folder(folder, subfolder)]
     items.sort(key=lambda item: (-item.changed_s, item.place))
     # An item that contains the others is kept, however many are newer.
@@ -90,3 +93,38 @@ def recordings_in(folder: Path) -> dict[Path, float]:
         }
     except OSError:
         return {}
+
+
+def is_locked(folder: Path) -> bool | None:
+    """Whether a run has locked a folder, without trying to lock it; None if the system does not report it."""
+    try:
+        numbers = {str(path.stat().st_ino) for path in (folder, folder / LOCK) if path.exists()}
+        lines = [line.split() for line in _LOCKS.read_text().splitlines()]
+    except OSError:
+        return None
+    # A process that waits for a lock has an arrow before it, and does not hold it.
+    return any(words[1:2] == ["FLOCK"] and words[5].rpartition(":")[2] in numbers for words in lines if len(words) > 5)
+
+
+def state_of(folder: Path, *, is_done: bool) -> dict[str, Any]:
+    """The state of work in a folder, with a message."""
+    if is_done:
+        return {"state": "ended", "message": "everything is done"}
+    if (locked := is_locked(folder)) is None:
+        paths = [folder, folder / "jobs", *folder.glob("*/jobs"), *(folder / UNFINISHED).rglob("*")]
+        locked = time.time() - max(changed_s(path) or 0.0 for path in paths) < _SILENT_S
+    if locked:
+        return {"state": "running", "message": ""}
+    message = (
+        "no program is working in the folder: the run was stopped, was killed or failed (its command then reported "
+        "why); run its command again to continue"
+    )
+    return {"state": "silent", "message": message}
+
+
+def changed_s(path: Path) -> float | None:
+    """When a file or folder last changed; None if there is none."""
+    try:
+        return path.stat().st_mtime
+    except OSError:
+        return None

@@ -41,11 +41,7 @@ def text_of(path: Path, most_bytes: int) -> str:
 
 
 def expect_own(path: Path) -> Path:
-    """Refuse a link, which may lead anywhere, and what would block its reader for ever, such as a pipe.
-
-    Raises:
-        InvalidFile: naming the file and what it is.
-    """
+    """Refuse a link, which may lead anywhere, and what would block its reader for ever, such as a pipe."""
     if path.is_symlink():
         raise InvalidFile(f"{path}: expected a file, got a link")
     return expect_plain_file(path)
@@ -91,10 +87,7 @@ def _complete(curve: np.ndarray, dimensions: int) -> Float64[np.ndarray, "*_ col
 
 
 def mean_of_episodes(path: Path) -> tuple[float, int, int] | None:
-    """Mean return, number of policies and number of episodes of an arm of a study; None if it has no own episodes.
-
-    A file that holds something else may raise any error.
-    """
+    """Mean return, number of policies and number of episodes of an arm of a study; None if it has no own episodes."""
     arrays = _arrays_in(path, ("return", "actor", "over_time", "agent", "at_min"), _MOST_EPISODES_BYTES)
     if arrays is None:
         raise InvalidFile(f"{path}: expected the episodes of an arm")

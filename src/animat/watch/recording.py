@@ -13,12 +13,9 @@ from animat.errors import AnimatError, InvalidFile, counted
 from animat.plain_file import expect_plain_file
 from animat.recordings.recording import Recording
 from animat.responses.inspection import Inspection, inspect_recording
-from animat.watch.blocks import chart, curve, facts, table
-from animat.watch.discovery import recordings_in
-from animat.watch.plain import text
-from animat.watch.spikes import packed
-from animat.watch.state import is_locked
-from animat.watch.view import View, in_blocks
+from animat.watch.discovery import is_locked, recordings_in
+from animat.watch.plain import packed, text
+from animat.watch.view import View, chart, curve, facts, in_blocks, table
 
 _Content = tuple[Recording | None, Inspection | None, str]
 """A recording and its inspection, or why there is none."""

@@ -38,7 +38,6 @@ def serve(folder: Path, port: int, announce: Callable[[str], None], *, parent: i
     """Serve the page of a folder until Ctrl-C.
 
     Args:
-        folder: to watch.
         port: 0 for any free port.
         announce: called with the address.
         parent: id of a process; the server ends a minute after it has ended and the page was last requested.
@@ -88,10 +87,8 @@ def _end_after(parent: int, app: Any, server: Any) -> None:
 def watching(folder: Path) -> Iterator[None]:
     """Serve the page of a folder in a separate process, which stays up for a minute after the last request.
 
-    Its address is printed. The code in the block is independent of it.
-
-    Raises:
-        AnimatError: if its requirements are not installed, or it does not start.
+    Its address is printed. The code in the block is independent of it. Raises AnimatError if its requirements are not
+    installed, or it does not start.
     """
     expect_installed()
     # In its own session: Ctrl-C ends only the command, and the page shows how it ended.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 import os
 import time
@@ -11,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
 from animat.closed_loop.header import Header, read_header
 from animat.closed_loop.log import Record
@@ -18,17 +20,16 @@ from animat.closed_loop.session_data import LOG_FILE, RECORDING_FILE
 from animat.closed_loop.tick import STOP_FILE
 from animat.coding.mapping import Thresholds
 from animat.errors import InvalidArgument, InvalidFile, as_invalid_file
+from animat.goals.robot import robot_of
 from animat.progress import format_duration
+from animat.robots.base import Robot
+from animat.robots.drawing import draw_robot
 from animat.stimulation.stimulus import NOTHING
-from animat.watch.agents import by_agent
-from animat.watch.blocks import time_left
-from animat.watch.picture import drawn_robot, picture_of
-from animat.watch.plain import mapped, number, numbers, text
-from animat.watch.spikes import packed
-from animat.watch.state import is_locked
-from animat.watch.sums import PercentilesSince, Sums, first_readout
+from animat.watch.discovery import is_locked
+from animat.watch.plain import mapped, number, numbers, packed, text
+from animat.watch.sums import PercentilesSince, Sums, by_agent, first_readout
 from animat.watch.tail import Tail
-from animat.watch.view import View
+from animat.watch.view import View, time_left
 
 _MOST_RECORDS = 8000
 """Most records in a view: at 80 Hz more than a minute and a half."""
@@ -77,7 +78,7 @@ class SessionView(View):
                     break
                 if past is not None and past["observation"]:
                     earlier.append(past["observation"])
-            return picture_of(self._robot, tick, earlier[::-1])
+            return _picture_of(self._robot, tick, earlier[::-1])
 
     def _title(self) -> str:
         fields = self._fields
@@ -89,6 +90,7 @@ class SessionView(View):
         loop, channels = fields["loop"], header.channels
         # In older logs it is a name.
         mapping = mapped(loop.get("mapping")).get("name", loop.get("mapping"))
+        percentiles = {kind.name: list(kind.percentile_indices) for kind in (Thresholds(1), Thresholds(9))}
         return {
             "generation": self.tail.generation,
             "title": self._title(),
@@ -96,7 +98,8 @@ class SessionView(View):
             "observed": list(map(text, header.observed)),
             "readouts": list(map(text, header.readouts)),
             "mapping": text(mapping),
-            "thresholds": _thresholds(mapping),
+            # Which of the eleven percentiles it compares responses with; both ends if not known.
+            "thresholds": percentiles.get(mapping, [0, 10]),
             "adaptive": bool(loop.get("adaptive")),
             "percentiles_hz": first_readout(loop.get("percentiles")),
             "planned": len(fields.get("turns", ())),
@@ -153,7 +156,7 @@ class SessionView(View):
                 raise InvalidFile(f"{self.file}: expected a log of a session, got one without a whole beginning")
             self._header: Header = read_header(self.file, first.fields)
             self._fields = first.fields
-            self._robot = drawn_robot(first.fields["loop"])
+            self._robot = _drawn_robot(first.fields["loop"])
             self._sums, self._agents_due_s = Sums(self.tail), 0.0
             self._generation = self.tail.generation
         return is_whole
@@ -262,12 +265,6 @@ def _span(fields: dict[str, Any]) -> tuple[float, float] | None:
     return start_s, start_s + duration_s
 
 
-def _thresholds(mapping: Any) -> list[int]:
-    """Which of the eleven percentiles a mapping compares responses with; both ends if not known."""
-    known = {kind.name: list(kind.percentile_indices) for kind in (Thresholds(1), Thresholds(9))}
-    return known.get(mapping, [0, 10])
-
-
 def _in_force(rows: Sequence[PercentilesSince], shown: Sequence[PercentilesSince]) -> list[PercentilesSince]:
     """The session's rows, evenly thinned to 400 but including the last, and all rows of the span shown."""
     step = max(1, math.ceil(len(rows) / 400))
@@ -281,9 +278,7 @@ def _in_force(rows: Sequence[PercentilesSince], shown: Sequence[PercentilesSince
 def stop_session(folder: Path) -> None:
     """Ask a session to end, without waiting or reading anything first, as it may be urgent.
 
-    Raises:
-        InvalidArgument: if there is no session, or it has ended.
-        InvalidFile: if the file cannot be created.
+    Raises InvalidArgument if there is none, or it has ended, and InvalidFile if the file cannot be created.
     """
     if not (folder / LOG_FILE).is_file():
         raise InvalidArgument(f"{folder.name}: expected a session to stop, got none")
@@ -292,3 +287,28 @@ def stop_session(folder: Path) -> None:
     with as_invalid_file(folder / STOP_FILE, "cannot be created"):
         # Never through a link, which may lead anywhere.
         os.close(os.open(folder / STOP_FILE, os.O_CREAT | os.O_WRONLY | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666))
+
+
+def _drawn_robot(loop: dict[str, Any]) -> Robot[Any] | None:
+    """The robot of a session's header; None if it is not known here or cannot be drawn."""
+    try:
+        robot = robot_of(loop)
+    except Exception:  # a robot of a third party may raise anything
+        return None
+    return robot if hasattr(robot, "draw") else None
+
+
+def _picture_of(robot: Robot[Any], tick: dict[str, Any], earlier: Sequence[Any]) -> bytes | None:
+    """A PNG of a robot at a tick with the earlier observations of its episode; None if nothing has been observed."""
+    observation = tick["observation"] or (earlier[-1] if earlier else None)
+    if not observation:
+        return None
+    picture = draw_robot(
+        robot,
+        np.array(observation, np.float64),
+        command=np.array(tick["command"] or 0.0, np.float64)[()],
+        earlier=[np.array(past, np.float64) for past in earlier],
+    )
+    png = io.BytesIO()
+    Image.fromarray(picture).save(png, "PNG", compress_level=1)
+    return png.getvalue()

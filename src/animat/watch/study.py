@@ -7,11 +7,10 @@ from typing import Any
 
 from animat.errors import some_of
 from animat.execution.task import PLANNED, UNFINISHED
-from animat.watch.blocks import Width, facts, table, time_left
+from animat.watch.discovery import changed_s, state_of
 from animat.watch.files import JobProgress, job_progress, json_of, mean_of_episodes
 from animat.watch.plain import mapped, number, text
-from animat.watch.state import changed_s, state_of
-from animat.watch.view import View, in_blocks
+from animat.watch.view import View, Width, facts, in_blocks, table, time_left
 
 _MOST_RECEIPTS, _MOST_SHOWN = 5000, 300
 _CONTEXT = "context study"

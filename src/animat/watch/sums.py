@@ -1,4 +1,4 @@
-"""Totals, episodes and faults of a session so far, counted in slices while it is watched."""
+"""Totals, faults and returns of a session so far, counted in slices while it is watched."""
 
 from __future__ import annotations
 
@@ -6,16 +6,20 @@ import math
 import time
 from array import array
 from collections import Counter
+from collections.abc import Sequence
+from statistics import fmean, stdev
 from typing import Any
 
-from animat.closed_loop.outline import Outline
-from animat.watch.plain import number, numbers, text
+from animat.closed_loop.outline import Episode, Outline
+from animat.watch.plain import mapped, number, numbers, text
 from animat.watch.tail import Tail
 
 _MOST_FAULTS = 50
 """Most faults shown."""
 _MOST_THRESHOLDS = 20_000
 """Most changes of thresholds kept; beyond it every second one is dropped, repeatedly."""
+_MOST_RETURNS = 200
+"""Most returns drawn per agent: the last ones."""
 _LOOKS = 64
 """Records between two looks at the clock."""
 
@@ -27,10 +31,8 @@ class Sums:
     """The totals of a log's records counted so far.
 
     Attributes:
-        counted: number of records counted.
         totals: for each record the return of its episode so far; NaN without a tick.
         wall_s: of the last tick, on the program's clock; None before the first.
-        on_electrode: number of pulses on each electrode.
         faults: the last ones: when, on the session's clock, and what happened.
         percentiles: the thresholds since each change.
         strange: number of records that are not understood.
@@ -97,3 +99,40 @@ class Sums:
 def first_readout(percentiles: Any) -> list[float | None]:
     """The percentiles of the first or only readout."""
     return numbers(percentiles[0] if percentiles and isinstance(percentiles[0], list) else percentiles)
+
+
+def by_agent(names: Sequence[str], episodes: Sequence[Episode], predictions: Any) -> list[dict[str, Any]]:
+    """For each agent: the number of whole episodes, their returns, and the mean with its 95 % interval.
+
+    The names of the agents and the predictions are those of the session's header; what is no prediction is left out.
+    """
+    predicted = {}
+    for name, row in mapped(predictions).items():
+        values = [number(mapped(row).get(key)) for key in ("mean", "low", "high")]
+        if None not in values:
+            predicted[text(name)] = values
+    returns_of: dict[str, list[float]] = {text(name): [] for name in names}
+    for episode in episodes:
+        returns = returns_of.setdefault(text(episode.agent), [])
+        if episode.is_whole and number(episode.total) is not None:
+            returns.append(episode.total)
+    return [
+        {
+            "name": name,
+            "n": len(returns),
+            "returns": returns[-_MOST_RETURNS:],
+            "mean": number(fmean(returns)) if returns else None,
+            "half": number(_half_width(returns)),
+            "predicted": predicted.get(name),
+        }
+        for name, returns in returns_of.items()
+    ]
+
+
+def _half_width(returns: Sequence[float]) -> float | None:
+    """Half the width of the 95 % interval of a mean, by Student's t; None if returns do not show how they vary."""
+    if len(set(returns)) < 2:
+        return None
+    from scipy.special import stdtrit
+
+    return float(stdtrit(len(returns) - 1, 0.975)) * stdev(returns) / math.sqrt(len(returns))

@@ -46,11 +46,7 @@ class Tail:
             self._file = None
 
     def grow(self, within_s: float) -> bool:
-        """Find the records that were added; False if time ran out before the end of the file.
-
-        Raises:
-            InvalidFile: if there is no log, or the file is not one.
-        """
+        """Find the records that were added; False if time ran out; raises InvalidFile if the file is not a log."""
         size = self._open()
         assert self._file is not None
         until_s, place = time.monotonic() + within_s, self._places[-1]

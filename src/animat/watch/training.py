@@ -3,22 +3,33 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
+from jaxtyping import Float64
 
 from animat.execution.task import UNFINISHED
-from animat.watch.blocks import facts, table, time_left
+from animat.training.policy import CURVE
+from animat.watch.discovery import changed_s, state_of
 from animat.watch.files import JobProgress, curve_of_policy, curves_of_checkpoint, job_progress, json_of
-from animat.watch.learning import Curves, learning_charts, levels_of
-from animat.watch.plain import settings, text
-from animat.watch.state import changed_s, state_of
-from animat.watch.view import View, in_blocks
+from animat.watch.plain import listed, mapped, number, settings, text
+from animat.watch.view import View, chart, curve, facts, in_blocks, table, time_left
 
 _MOST_POLICIES = 1000
 _CHUNKS = 60
 """Parts of a training, and points of a learning curve."""
+_LEARNER = (
+    ("entropy", "nats", "Of the policy's choice of actions: high while it is almost random, low once it is certain."),
+    ("alpha", "", "The weight of entropy relative to reward, adjusted so that entropy reaches its target."),
+    ("critic_loss", "", "How far the critics are from the returns they learn to predict, in squared scaled rewards."),
+)
+_COLOURS = {"random actions": "grey", "best coupling": "green", "optimal return": "orange"}
+"""Colours of the lines with which returns are compared."""
+
+Curves: TypeAlias = dict[int, Float64[np.ndarray, "chunks columns"]]
+"""Learning curves by policy number, with the columns of `CURVE`."""
 
 
 class TrainingView(View):
@@ -58,8 +69,8 @@ class TrainingView(View):
             *_in_use(training, minutes, max(shares.values(), default=0.0)),
             ("algorithm", settings(training.get("algorithm", {}))),
         ]
-        levels, missing = levels_of(manifest.get("random_return"), json_of(self.folder / "evaluation.json"))
-        charts = learning_charts(curves, _swaps(training, minutes), iterations, levels, missing)
+        levels, missing = _levels_of(manifest.get("random_return"), json_of(self.folder / "evaluation.json"))
+        charts = _learning_charts(curves, _swaps(training, minutes), iterations, levels, missing)
         return in_blocks(state, [facts("So far", rows), *charts, _table(curves, shares, progress)])
 
     def _learned(self, planned: int, progress: JobProgress) -> tuple[Curves, dict[int, float]]:
@@ -69,17 +80,16 @@ class TrainingView(View):
         # Checkpoints of groups on cores, and of all policies trained together on a GPU.
         unfinished = self.folder / UNFINISHED
         for path in (*unfinished.glob("from-p*.npz"), *unfinished.glob("at-once-*.npz")):
-            for i, curve in (self._content(path, curves_of_checkpoint) or {}).items():
-                curves[i], shares[i] = curve, min(1.0, len(curve) / _CHUNKS)
+            for i, rows in (self._content(path, curves_of_checkpoint) or {}).items():
+                curves[i], shares[i] = rows, min(1.0, len(rows) / _CHUNKS)
         for name, (share, _) in progress.items():
             members = re.fullmatch(r"p(\d{1,6})(?: to p(\d{1,6}))?", name)
             if members is not None:
                 last = min(int(members[2] or members[1]), planned - 1)
                 shares |= {i: max(shares[i], min(share, 1.0)) for i in range(int(members[1]), last + 1)}
         for i in range(planned):
-            curve = self._content(self.folder / f"p{i}.safetensors", curve_of_policy)
-            if curve is not None:
-                curves[i], shares[i] = curve, 1.0
+            if (rows := self._content(self.folder / f"p{i}.safetensors", curve_of_policy)) is not None:
+                curves[i], shares[i] = rows, 1.0
         known = range(planned)
         return {i: curves[i] for i in known if i in curves}, {i: shares[i] for i in known}
 
@@ -123,3 +133,68 @@ def _table(curves: Curves, shares: dict[int, float], progress: JobProgress) -> d
         rows.append([f"p{i}", f"{100 * share:.0f} %", returns[-1] if returns else "none yet"])
     note = "; ".join(f"{name}: {100 * share:.0f} % {message}".strip() for name, (share, message) in progress.items())
     return table("Policies", ["policy", "done", "last return"], rows, note, width="whole")
+
+
+def _levels_of(random_return: float | None, evaluation: Mapping[str, Any]) -> tuple[dict[str, float], str]:
+    """Returns to compare with, by name, and a note on their source and on those that are not known."""
+    # The evaluation is a file of the user's, which may hold anything.
+    listed_rows = map(mapped, listed(evaluation.get("rows")))
+    rows = {text(row.get("name")): number(row.get("mean_return")) for row in listed_rows}
+    returns = {
+        "random actions": rows.get("random", random_return),
+        "best coupling": rows.get("coupling"),
+        "optimal return": number(mapped(evaluation.get("optimum")).get("value")),
+    }
+    known = {name: value for name, value in returns.items() if value is not None}
+    note = f"Lines: {', '.join(f'{name} {value:.4g}' for name, value in known.items())}." if known else ""
+    if rows and (minute := number(evaluation.get("recorded_at_min"))) is not None:
+        note += f" They are on the simulator of minute {minute:g}, from evaluation.json."
+    elif known and not rows:
+        note = note[:-1] + ", on the first simulator."
+    if missing := [name for name in returns if name not in known]:
+        note += f" Not known: {', '.join(missing)}. To show them, run animat evaluate with --optimum and "
+        note += "--out evaluation.json, in this folder."
+    return known, note.strip()
+
+
+def _learning_charts(
+    curves: Curves, swaps: Sequence[tuple[float, str]], iterations: float, levels: Mapping[str, float], missing: str
+) -> list[dict[str, Any]]:
+    """The learning curves, and entropy, alpha and critic loss over the same iterations."""
+    series, last = _series(curves, "mean_return")
+    note = "No learning curve is in the folder yet: the first checkpoint is written some seconds after the start."
+    if series:
+        note = f"Mean return of the latest episodes: {'none has ended yet' if last is None else f'{last:.1f}'}. "
+        note += "Grey: each policy; blue: the mean of those that have come so far. A point is a 60th of the training."
+    note += " Dashed vertical: the simulators are refreshed with the recording of that minute." if swaps else ""
+    series += [curve(name, [0.0, iterations], [y, y], "dashed", _COLOURS[name]) for name, y in levels.items()]
+    note = f"{note} {missing}".strip()
+    charts = [chart("Learning curves", "iterations", "return", series, note, marks=swaps, until=iterations)]
+    for column, unit, meaning in _LEARNER:
+        series, last = _series(curves, column)
+        if not series:
+            note = f"Known from the first checkpoint on. {meaning}"
+        elif last is None:
+            note = "Not in these files: they were written before it was kept."
+        else:
+            note = f"{last:.3g} on average, at the last checkpoint. {meaning}"
+        title = column.replace("_", " ").capitalize()
+        charts.append(chart(title, "iterations", unit, series, note, until=iterations, width="third"))
+    return charts
+
+
+def _series(curves: Curves, column: str) -> tuple[list[dict[str, Any]], float | None]:
+    """One column of the curves of each policy, and their mean, with the last value of the mean."""
+    at = CURVE.index(column)
+    series = [curve("", rows[:, 0].tolist(), rows[:, at].tolist(), "thin", "grey") for rows in curves.values()]
+    longest = max(curves.values(), key=len, default=np.zeros((0, len(CURVE))))
+    if not len(longest):
+        return series, None
+    values = np.full((len(curves), len(longest)), np.nan)
+    for row, rows in zip(values, curves.values(), strict=True):
+        row[: len(rows)] = rows[:, at]
+    known = np.isfinite(values)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mean = np.where(known, values, 0.0).sum(axis=0) / known.sum(axis=0)
+    series.append(curve("mean of the policies", longest[:, 0].tolist(), mean.tolist(), "line", "blue"))
+    return series, next((x for x in mean[::-1].tolist() if np.isfinite(x)), None)

@@ -1,29 +1,29 @@
-"""The view of a watched folder; each kind of folder has its own view."""
+"""The view of a watched folder, of which each kind has its own, and the blocks that most views are made of."""
 
 from __future__ import annotations
 
 import abc
+import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 from animat.errors import InvalidArgument, InvalidFile, first_line
-from animat.folder_kinds import MARKERS, Kind
-from animat.progress import Speed
+from animat.folders import MARKERS, Kind
+from animat.progress import Speed, format_duration
 from animat.watch.files import json_of
+from animat.watch.plain import number, text
 
 _MOST_SPAN_S = 60.0
 """Longest span shown at once, and over which the speed of work is measured."""
 
+Width = Literal["third", "half", "two-thirds", "whole"]
+Style = Literal["line", "thin", "dashed", "dots", "steps"]
+
 
 class View(abc.ABC):
-    """A folder that is viewed repeatedly.
-
-    Attributes:
-        kind: of the folder.
-        file: that identifies it.
-    """
+    """A folder of one `kind` that is viewed repeatedly; `file` identifies it."""
 
     kind: ClassVar[Kind]
 
@@ -39,9 +39,7 @@ class View(abc.ABC):
     def view(self, to_s: float | None, span_s: float) -> dict[str, Any]:
         """The current view, of the seconds before a time (None: now, or the end); most views have no clock.
 
-        Raises:
-            InvalidFile: if the folder's files cannot be read, or hold something else.
-            InvalidArgument: for an invalid span.
+        Raises InvalidFile if the folder's files cannot be read, or hold something else.
         """
         if not 0 < span_s <= _MOST_SPAN_S:
             raise InvalidArgument(f"span: expected above 0 and at most {_MOST_SPAN_S:g} s, got {span_s:g}")
@@ -81,3 +79,56 @@ class View(abc.ABC):
 def in_blocks(state: dict[str, Any], blocks: Sequence[dict[str, Any]], damage: str = "") -> dict[str, Any]:
     """A view made of blocks, with the state of the work."""
     return {"generation": 0, **state, "damage": damage, "blocks": list(blocks)}
+
+
+def chart(
+    title: str,
+    x: str,
+    y: str,
+    series: Sequence[dict[str, Any]],
+    note: str,
+    *,
+    marks: Sequence[tuple[float, str]] = (),
+    until: float | None = None,
+    width: Width = "two-thirds",
+) -> dict[str, Any]:
+    """Curves (`curve`) over one axis, which reaches to `until` at least; `marks` are places on it with their labels."""
+    labelled = [[number(at), text(label)] for at, label in marks]
+    return {
+        "kind": "chart", "title": title, "x": x, "y": y, "series": list(series), "words": text(note, 2000),
+        "marks": labelled, "until": number(until), "width": width,
+    }  # fmt: skip
+
+
+def curve(name: str, x: Sequence[float], y: Sequence[float], style: Style, colour: str) -> dict[str, Any]:
+    """A curve of a chart: its name in the legend (empty: none), and its points, thinned if there are many."""
+    step = max(1, math.ceil(len(x) / 2000))
+    xs, ys = ([number(float(value)) for value in values[::step]] for values in (x, y))
+    return {"name": text(name), "x": xs, "y": ys, "style": style, "colour": colour}
+
+
+def table(
+    title: str, head: Sequence[str], rows: Sequence[Sequence[Any]], note: str = "", *, width: Width = "half"
+) -> dict[str, Any]:
+    """Rows of texts and numbers; the page formats the numbers."""
+    cells = [[_cell(value) for value in row] for row in rows]
+    return {
+        "kind": "table", "title": title, "head": list(head), "rows": cells, "words": text(note, 2000), "width": width,
+    }  # fmt: skip
+
+
+def facts(title: str, rows: Sequence[tuple[str, Any]], note: str = "") -> dict[str, Any]:
+    """Names with one value each."""
+    pairs = [[name, _cell(value, 1000)] for name, value in rows]
+    return {"kind": "facts", "title": title, "rows": pairs, "words": text(note, 2000)}
+
+
+def _cell(value: Any, most: int = 300) -> Any:
+    return number(value) if value is None or isinstance(value, int | float) else text(value, most)
+
+
+def time_left(seconds: float | None, state: dict[str, Any]) -> str:
+    """The remaining time of work in a state (`animat.watch.discovery.state_of`)."""
+    if state["state"] != "running":
+        return "none: it has ended" if state["state"] == "ended" else "none: it is not running"
+    return "not known yet" if (known := number(seconds)) is None else format_duration(known)

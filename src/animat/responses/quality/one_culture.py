@@ -17,10 +17,7 @@ from animat.tables import UNKNOWN
 
 
 def series_mismatch(series: Sequence[Responses]) -> str | None:
-    """How recordings differ that simulators in one timeline must share, or which two share a minute; None if nothing.
-
-    `series` is in the order of time.
-    """
+    """How recordings, in the order of time, differ in what a timeline must share, or which share a minute, if any."""
     first = series[0]
     for other in series[1:]:
         for name in ("conditions", "window_ms", "presentation", "readouts"):

@@ -18,10 +18,8 @@ from animat.responses.condition import RESTING
 from animat.responses.conditions import NO_CONDITION, Assignment, conditions_named
 from animat.responses.psth import ResponseTime, find_response, post_stimulus_histogram, spontaneous_rate
 from animat.responses.quality.drift import drift_findings
-from animat.responses.quality.memory import memory_findings
-from animat.responses.quality.repetition import repetition_findings
-from animat.responses.quality.resolution import resolution_findings
-from animat.responses.quality.timing import artefact_findings
+from animat.responses.quality.history import memory_findings, repetition_findings
+from animat.responses.quality.timing import artefact_findings, resolution_findings
 from animat.responses.readouts import CUT_NAMES
 from animat.responses.responses import Responses
 from animat.stimulation.stimulus import Stimuli

@@ -1,4 +1,4 @@
-"""Artefacts around a stimulus: spikes that are none, and blanked stretches."""
+"""What is wrong with spike times: artefacts around a stimulus, blanked stretches, and steps too coarse for a window."""
 
 from __future__ import annotations
 
@@ -28,6 +28,11 @@ LEFT_OUT, LEFT_OUT_SHARE = 2, 0.02
 artefact: a burst may happen to fall there."""
 ENOUGH = 10.0
 """Spikes expected in a stretch for their absence to count as a blank."""
+COARSE = 0.25
+"""Share of the window above which a step of the times is too coarse."""
+ENOUGH_SPIKES, ENOUGH_STEPS = 1000, 20
+WHOLE, NEARLY_ALL = 0.01, 0.99
+"""How close intervals must be to a whole number of steps, and the share of intervals that must be."""
 
 
 def artefact_findings(
@@ -153,3 +158,26 @@ def _blank(
         f"too low by as much{'' if is_elsewhere else remedy}"
     )
     yield Finding("blanked-window", "note" if lost <= 0.15 else "warning", message, min(lost, 1.0))
+
+
+def resolution_findings(recording: Recording, window_ms: tuple[float, float]) -> Iterator[Finding]:
+    """A finding on spike times that come in steps of more than a quarter of the window (`coarse-times`).
+
+    The step is the shortest interval between different spike times, if nearly all intervals are whole multiples of it.
+    Only the later half is examined, as times in single precision grow coarser.
+    """
+    time_s = np.unique(recording.spike_times_s[len(recording.spike_times_s) // 2 :])
+    if len(recording.spike_times_s) < ENOUGH_SPIKES or len(time_s) <= ENOUGH_STEPS:
+        return
+    interval_s = np.diff(time_s)
+    step_s = float(interval_s.min())
+    multiple = interval_s / step_s
+    width_ms = window_ms[1] - window_ms[0]
+    is_grid = np.mean(np.abs(multiple - np.rint(multiple)) < WHOLE) > NEARLY_ALL
+    if not is_grid or 1e3 * step_s <= COARSE * width_ms:
+        return
+    message = (
+        f"spike times come in steps of {1e3 * step_s:.3g} ms, too coarse for a window of {width_ms:g} ms: which spikes "
+        "it holds is chance; supply times in double precision (float64, more decimals), or use a longer window"
+    )
+    yield Finding("coarse-times", "warning", message, 1e3 * step_s)

@@ -1,4 +1,4 @@
-"""Where two descriptions differ, for the error about a folder that holds something else than was requested."""
+"""What a folder holds: the files that identify its kind, and where its description differs from what is requested."""
 
 from __future__ import annotations
 
@@ -6,33 +6,57 @@ import hashlib
 import json
 from collections.abc import Collection
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from animat.errors import InvalidFile, Mismatch
+from animat.plain_file import is_folder
 
+Kind = Literal["session", "training", "tuning", "study", "cultures", "recording", "live"]
+
+MARKERS: dict[Kind, tuple[str, ...]] = {
+    "session": ("session.log",),
+    "training": ("training.json", "[!.]*.safetensors"),
+    "tuning": ("tune.json",),
+    "study": ("study.json",),
+    "cultures": ("cultures.json",),
+    "recording": ("recording_*_min.nwb", "culture.state"),
+    "live": ("live.log",),
+}
+"""Names or patterns, any one of which is enough. The modules that write these files import JAX; this one does not."""
+_DESCRIPTIONS: dict[Kind, str] = {
+    "session": "a session",
+    "training": "policies",
+    "tuning": "a tuning",
+    "study": "a study",
+    "cultures": "a study of many cultures",
+    "recording": "recordings",
+    "live": "a live run",
+}
 _LONGEST = 60
+"""Length of a value in a message."""
+_NOTHING = object()
+"""The value of a missing key."""
 
 
-class _Nothing:
-    """The value of a missing key."""
-
-    def __repr__(self) -> str:
-        return "nothing"
-
-
-_NOTHING = _Nothing()
+def expect_no_other(folder: Path, kind: Kind) -> None:
+    """Raise Mismatch if a folder holds work of other kinds and none of this kind; a missing folder holds nothing."""
+    if not is_folder(folder):
+        return
+    found = {each: [file.name for name in names for file in folder.glob(name)] for each, names in MARKERS.items()}
+    others = ", ".join(f"{_DESCRIPTIONS[each]} ({min(names)})" for each, names in found.items() if names)
+    # Work of this kind continues, whatever else is in the folder.
+    if others and not found[kind]:
+        wanted = _DESCRIPTIONS[kind]
+        raise Mismatch(f"{folder}: expected a folder for {wanted}, got one with {others}; choose another folder")
 
 
 def first_difference(
     found: Any, wanted: Any, name: str = "", *, ignoring: Collection[str] = (), first: Collection[str] = ()
 ) -> str:
-    """The first difference between two pieces of plain data, such as `training.seed: 1 there, 2 now`; empty if none.
+    """The first difference between data in a folder and those requested: `training.seed: 1 there, 2 now`; else empty.
 
-    Args:
-        found: the data in the folder.
-        wanted: the data requested now.
-        name: of both, for the beginning of the message.
-        ignoring, first: keys that do not matter, and keys that come first, at any depth.
+    `name` is that of both, for the beginning of the message; `ignoring` and `first` are keys that do not matter, and
+    keys that come first, at any depth.
     """
     if isinstance(found, dict) and isinstance(wanted, dict):
         pairs = [
@@ -85,5 +109,5 @@ def folder_mismatch(folder: Path, what: str, difference: str) -> Mismatch:
 
 
 def _short(value: Any) -> str:
-    text = repr(value)
+    text = "nothing" if value is _NOTHING else repr(value)
     return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 3]}..."
