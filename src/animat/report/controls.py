@@ -9,9 +9,6 @@ from animat.report.html import with_minus
 from animat.report.results import TRAINED, ControlReturns
 from animat.report.style import BLUE, GREY, OPTIMUM, ORANGE, add_common_legend, grid_of_panels, style_axes, wrapped
 
-_TITLE_WIDE_IN = 3.0
-"""Width of a panel's title, which begins right of the names of the rows."""
-
 
 def draw_controls(panels_of: Sequence[tuple[str, Sequence[ControlReturns]]], title: str) -> Figure:
     """A titled panel per mapping and recording: returns of trained policies and controls, random ones, the optimum."""
@@ -29,7 +26,8 @@ def draw_controls(panels_of: Sequence[tuple[str, Sequence[ControlReturns]]], tit
             axes.axvline(optimum, color=OPTIMUM, linewidth=1.2, linestyle="--", label="optimal return")
         if rows[0].random is not None:
             axes.axvline(rows[0].random, color=GREY, linewidth=1.2, linestyle=":", label="random actions")
-        style_axes(axes, wrapped(through, _TITLE_WIDE_IN), "mean return and its standard error", "")
+        # Narrower than the panel, as it begins right of the names of the rows.
+        style_axes(axes, wrapped(through, 3.0), "mean return and its standard error", "")
         axes.locator_params(axis="x", nbins=5)
         axes.grid(axis="y", linewidth=0.4, alpha=0.5)
     add_common_legend(figure, panels, columns=4)

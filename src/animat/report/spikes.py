@@ -81,10 +81,7 @@ def draw_spontaneous(recording: Recording, bursts: NetworkBursts) -> Figure:
 def draw_psth(
     histogram: PostStimulusHistogram, window_ms: tuple[float, float], spontaneous_hz: float | None = None
 ) -> Figure:
-    """Mean rate per channel against the time from the stimulus; a stretch lost in the artefact is empty.
-
-    The response window is marked, and the spontaneous rate per channel is a line.
-    """
+    """Mean rate per channel by time from the stimulus, empty where it was lost, with window and spontaneous rate."""
     figure = new_figure(7.5, 3.8)
     axes = figure.subplots()
     rate_hz = np.nan_to_num(histogram.rate_hz)

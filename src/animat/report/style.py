@@ -32,10 +32,7 @@ _SAVING_LOCK = threading.Lock()
 
 
 def new_figure(width_in: float, height_in: float, title: str = "") -> Figure:
-    """An empty figure of a size in inches; it needs no display and changes no global state.
-
-    The title is on as many lines as it needs; dollar signs in it, as in names of files, stay.
-    """
+    """An empty figure of a size in inches, which needs no display; its title is wrapped and keeps its dollar signs."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
