@@ -761,6 +761,7 @@ def test_inspect_refuses_its_options_before_the_files(
         ("train --neural-observation --mapping none", "--neural-observation: expected only with a mapping"),
         ("train --mapping none --delivery shuffled", "--delivery: expected none without neurons"),
         ("train --mapping none --recordings .", "--recordings: expected none without neurons, got ."),
+        ("train --mapping none --recordings recordings", "--recordings: expected none without neurons, got recordings"),
         ("train --mapping none --bins 5", "--bins: expected none without neurons, got 5"),
         ("train --mapping none --window-ms 2 20.5", "--window-ms: expected none without neurons, got 2 20.5"),
         ("train --mapping none --percentiles first", "--percentiles: expected none without neurons, got first"),

@@ -92,7 +92,9 @@ class SimulatorOptions(ResponseOptions):
         for option in fields(self):
             value = getattr(self, option.name)
             if option.name in _OF_SIMULATORS and value != option.default:
-                raise InvalidArgument(f"{option.name}: expected none {where}, got {_typed(value)}")
+                # A folder may have the name of an option, such as `recordings`.
+                name = option.name.replace("_", "-")
+                raise InvalidArgument(f"--{name}: expected none {where}, got {_typed(value)}")
 
 
 _OF_SIMULATORS = (
