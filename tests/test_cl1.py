@@ -416,11 +416,15 @@ def test_spikes_on_ground_are_counted_and_not_recorded(neurons: Neurons) -> None
         spikes = culture.advance(0.1)
         assert [culture.channels.label[row] for row in spikes.channel] == ["8", "8"]
         assert culture.spikes_not_on_electrodes == 2
-        # A recording says what it does not have; what was before it is not its own, even if it is reported late.
-        neurons.queue = [(neurons.now + 14 - neurons.now % 7, 4, None), (7, 8, None)]  # type: ignore[list-item]
+        # A recording says what it does not have; what was before it is not its own.
+        neurons.queue = [(neurons.now + 14 - neurons.now % 7, 4, None)]  # type: ignore[list-item]
         protocol = Protocol(pulse=CL1_PULSE, trials=1, patterns=5, setup_s=0.0)
         assert culture.record(protocol).provenance["left_out"] == "1 spikes on ground or reference"
         assert "left_out" not in culture.record(protocol).provenance
+        # A spike that is reported after its time would be before the recording.
+        neurons.queue = [(7, 8, None)]  # type: ignore[list-item]
+        assert culture.record(protocol).provenance["left_out"] == "1 spikes reported late"
+        assert culture.spikes_reported_late == 1
 
 
 def test_patterns_use_every_kind_of_channel_that_can_and_positions_are_a_grid() -> None:

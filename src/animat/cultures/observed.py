@@ -51,9 +51,8 @@ def observed_in_frames(
 
     `begun` are the frames in which stimuli began, and `zero` is that in which the culture's clock is 0.
     """
-    # Spikes from before are reported late.
+    frame, row = frame[row != UNKNOWN], row[row != UNKNOWN]
     order = np.lexsort((row, frame))
-    order = order[(row[order] != UNKNOWN) & (frame[order] >= start)]
     spikes = Spikes((frame[order] - start) / rate, row[order])
     return Observed((start - zero) / rate, (stop - start) / rate, spikes, (begun - start) / rate)
 

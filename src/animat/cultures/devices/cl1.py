@@ -114,6 +114,8 @@ class CL1Culture(Culture):
         self._begun = History()
         self.spikes_not_on_electrodes = 0
         """Spikes that the device reported on ground or reference, which are not recording electrodes; left out."""
+        self.spikes_reported_late = 0
+        """Spikes that the device reported after the delivery, or the rest, in which they lie; left out."""
 
     @property
     def channels(self) -> Channels:
@@ -173,11 +175,12 @@ class CL1Culture(Culture):
 
     @property
     def left_out(self) -> dict[str, int]:
-        return {"spikes on ground or reference": self.spikes_not_on_electrodes}
+        late = self.spikes_reported_late
+        return {"spikes on ground or reference": self.spikes_not_on_electrodes, "spikes reported late": late}
 
     def _open(self) -> None:
         cl = _sdk()
-        self.spikes_not_on_electrodes = 0
+        self.spikes_not_on_electrodes = self.spikes_reported_late = 0
         with as_device_failure("CL1", "open", ": is another program using it?"):
             neurons = self._stack.enter_context(cl.open(take_control=True, wait_until_recordable=True))
             session = Session(cl, neurons, self._ticks_per_s, self._margin_frames, self._jitter)
@@ -199,7 +202,7 @@ class CL1Culture(Culture):
             return Observed(self.now_s, 0.0, Spikes(np.empty(0), np.empty(0, np.int64)), np.empty(0))
         session, since = while_open(self._session), round(admitted.now_s * FRAMES_PER_S)
         try:
-            observed, not_on_electrodes = session.deliver(admitted.stimuli, duration_s, since)
+            observed, not_on_electrodes, late = session.deliver(admitted.stimuli, duration_s, since)
         except BaseException as error:
             outcome = "what had not begun was interrupted"
             try:
@@ -218,6 +221,7 @@ class CL1Culture(Culture):
                 f"{outcome}{_remedy(error, session)}"
             ) from error
         self.spikes_not_on_electrodes += not_on_electrodes
+        self.spikes_reported_late += late
         return observed
 
     def _rest(self, duration_s: float) -> None:

@@ -71,11 +71,12 @@ class Session:
         """Stop pulses in progress on every channel, and clear the queue."""
         self.neurons.interrupt(self.cl.ChannelSet(*SITES))
 
-    def deliver(self, stimuli: Sequence[Stimulus], duration_s: float, since: int) -> tuple[Observed, int]:
+    def deliver(self, stimuli: Sequence[Stimulus], duration_s: float, since: int) -> tuple[Observed, int, int]:
         """Deliver, and read until `duration_s` after the loop starts, extended by the delay of the stimuli.
 
         Times of stimuli count from the frame `since`, no later than the start. Also returns how many spikes were not on
-        electrodes; raises DeviceFailed if it was stopped half way, or a pulse never came.
+        electrodes, and how many are from before the start; raises DeviceFailed if it was stopped half way, or a pulse
+        never came.
         """
         waiting, requested = deque(stimuli), [since + _frames(stimulus.time_s) for stimulus in stimuli]
         queued: list[int] = []
@@ -105,8 +106,10 @@ class Session:
             raise DeviceFailed(f"CL1: expected a loop over {duration_s:g} s, got one that ended early")
         began = [_began(stimulus, due, reported, start) for stimulus, due in zip(stimuli, queued, strict=True)]
         frame_of, row = np.array(frames, np.int64), _ROW_OF[np.array(channels, np.int64)]
+        is_late = frame_of < start
+        frame_of, row = frame_of[~is_late], row[~is_late]
         observed = observed_in_frames(start, stop, frame_of, row, np.array(began, np.float64), FRAMES_PER_S)
-        return observed, int(np.count_nonzero(row == UNKNOWN))
+        return observed, int(np.count_nonzero(row == UNKNOWN)), int(np.count_nonzero(is_late))
 
     def _check_going(self, queued: int, total: int) -> None:
         if total and self._halted.is_set():
