@@ -57,7 +57,7 @@ def describe_study(study: Study, sources: dict[str, str], device: str | None = N
             "sources": sources,
             # Another version may round differently, or draw other figures.
             "versions": versions,
-            "seeds": {"culture": study.culture.seed, "training and evaluation, with the culture's name": study.seed},
+            "seeds": {"culture": study.culture.seed, "study": study.seed},
         }
     )
 
