@@ -214,7 +214,10 @@ def test_spikes_are_by_channel_and_those_of_no_electrode_are_counted(rig: Rig) -
         assert culture.channels.electrode[spikes.channel].tolist() == [RECORDED[31], RECORDED[32]]
         assert culture.channels.label[spikes.channel].tolist() == ["31", "32"]
         assert culture.spikes_not_recorded == 1
-        assert culture.left_out == {"spikes on amplifiers without an electrode": 1, "frames lost on the way": 0}
+        without = {"spikes on amplifiers without an electrode": 1, "frames lost on the way": 0}
+        assert culture.left_out == without | {"spikes reported late": 0}
+        stream.late_spikes = 2  # type: ignore[attr-defined]
+        assert culture.left_out == without | {"spikes reported late": 2}
 
 
 def test_a_stop_takes_the_power_and_says_what_was_sent(rig: Rig) -> None:
@@ -391,7 +394,13 @@ def test_spikes_that_come_out_of_order_are_taken_by_their_frame() -> None:
         spikes["frame"], spikes["channel"] = frames, [1, 2]
         stream.hear([np.uint64(message).tobytes(), b"", spikes.tobytes()])
     assert stream.take(980, 1005)[0].tolist() == [990, 1004]
-    assert stream.take(1005, 1030)[0].tolist() == [1010, 1015]
+    # One comes after the frames around it were taken.
+    spikes["frame"] = [1001, 1022]
+    stream.hear([np.uint64(1024).tobytes(), b"", spikes.tobytes()])
+    assert stream.take(1005, 1030)[0].tolist() == [1010, 1015, 1022]
+    assert stream.late_spikes == 1
+    stream.take(1040, 1040)
+    assert stream.late_spikes == 1
 
 
 @pytest.mark.parametrize("layout", [EVENT_24, EVENT_16])
