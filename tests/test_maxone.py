@@ -17,6 +17,7 @@ from animat.cultures.contract import CultureContract
 from animat.cultures.devices.maxone import MAXONE_LIMITS, MaxOneCulture
 from animat.cultures.devices.maxone_sequences import dac_code
 from animat.cultures.devices.maxone_stream import EVENT_16, EVENT_24, ZmqSpikes
+from animat.cultures.same_culture import other_channels
 from animat.errors import DeviceFailed, InvalidArgument, UnsafeStimulus
 from animat.recordings.formats.stimulus_text import parse_line
 from animat.stimulation.array import MAXONE
@@ -25,6 +26,7 @@ from animat.stimulation.protocol import Protocol
 from animat.stimulation.pulse import BALANCED_PULSE, PUBLISHED_PULSE, Phase, Pulse
 from animat.stimulation.selection import Selection
 from animat.stimulation.stimulus import Stimulus
+from animat.tables import UNKNOWN
 from stand_in_maxlab import LSB_MV, Rig, Stream, install
 
 SITES = [(20 + 25 * (i // 8)) * 220 + 15 + 25 * (i % 8) for i in range(32)]
@@ -70,8 +72,16 @@ def test_stimulation_electrodes_that_were_not_routed_are_refused_by_name(rig: Ri
 
 
 def test_recording_electrodes_that_were_not_routed_are_left_out_and_counted(rig: Rig) -> None:
+    rig.drop = {13_052}
+    with culture_on(rig) as culture:
+        recording = culture.record(Protocol((40.0,), trials=2, setup_s=0.0, pause_s=0.0, pulse=BALANCED_PULSE))
+        assert other_channels(recording, culture) is None
     rig.drop = {13_050, 13_051}
     with culture_on(rig) as culture:
+        found = other_channels(recording, culture)
+        assert found is not None and (found.name, found.value) == ("other-channels", 3)
+        unknown = replace(recording.channels, electrode=np.full(len(recording.channels), UNKNOWN))
+        assert other_channels(replace(recording, channels=unknown), culture) is None
         assert culture.not_routed == (13_050, 13_051)
         assert len(culture.channels) == len(RECORDED) - 2
         assert culture.provenance["not_routed"] == "13050 13051"
