@@ -8,12 +8,14 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import numba
 import pytest
 
 import animat
 from animat import compilation, devices
-from animat.compilation import cache_folder, cached_njit
+from animat.compilation import cache_folder, cached_njit, jit_side_by_side
 
 
 def test_what_cannot_be_kept_is_compiled_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -64,12 +66,19 @@ def test_options_of_the_processor_s_compiler_do_not_reach_that_of_a_gpu(monkeypa
     assert "xla_gpu_deterministic_ops" not in runpy.run_path(compilation.__file__)["COMPILER_OPTIONS"]
 
 
+def test_policies_are_trained_in_32_bits_whatever_the_user_computes_in() -> None:
+    ones = jnp.ones(2)
+    with jax.enable_x64(True):
+        assert jit_side_by_side(lambda x: x + jnp.zeros(3))(ones).dtype == jnp.float32
+
+
 COMPILING = """
 import sys
 from animat.compilation import keep_compilations
 keep_compilations()
 import jax
-print(jax.jit(lambda x: x + 1)(1), jax.config.jax_compilation_cache_dir)
+one = jax.jit(lambda x: x + 1)(0)
+print(one, one.dtype, jax.config.jax_compilation_cache_dir)
 from synthetic_recordings import synthetic_recording
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.reading import read_recording
@@ -90,9 +99,9 @@ def test_a_home_that_is_a_file_keeps_nothing_and_says_nothing(tmp_path: Path) ->
     done = subprocess.run(
         [sys.executable, "-c", COMPILING, str(tmp_path / "für mich.nwb")],
         cwd=Path(__file__).parent,
-        env=without | {"HOME": str(home), "LC_ALL": language},
+        env=without | {"HOME": str(home), "LC_ALL": language, "JAX_ENABLE_X64": "1"},
         capture_output=True,
         text=True,
         check=False,
     )
-    assert (done.returncode, done.stdout, done.stderr) == (0, "2 None\nTrue\n", "")
+    assert (done.returncode, done.stdout, done.stderr) == (0, "1 int32 None\nTrue\n", "")

@@ -31,11 +31,13 @@ results reproducible to the bit. Options that `XLA_FLAGS` sets are left alone.
 def jit_side_by_side(
     program: Callable[..., Any], in_axes: int | tuple[int | None, ...] = 0, donate_argnums: int | tuple[int, ...] = ()
 ) -> Callable[..., Any]:
-    """Compile a program of one policy, when it is first called, for several policies side by side."""
+    """Compile a program of one policy, when it is first called, for several policies side by side; in 32 bits."""
     import jax
 
     several = jax.vmap(program, in_axes)
-    return jax.jit(several, donate_argnums=donate_argnums, compiler_options=COMPILER_OPTIONS)
+    compiled = jax.jit(several, donate_argnums=donate_argnums, compiler_options=COMPILER_OPTIONS)
+    # Even where the user's own code computes in 64 bits: learners and checkpoints have one precision.
+    return jax.enable_x64(False)(compiled)  # type: ignore[no-any-return]
 
 
 def cache_folder() -> Path:
@@ -47,11 +49,12 @@ def cache_folder() -> Path:
 def keep_compilations() -> None:
     """Let JAX keep what it compiles in `cache_folder()`, if that is writable; for a process that will compile.
 
-    It also hides everything imported so far from the garbage collector: scanning all of JAX again and again took a
-    quarter of the tracing time.
+    It also turns off 64 bits, whatever `JAX_ENABLE_X64` says, on which results must not depend, and hides everything
+    imported so far from the garbage collector: scanning all of JAX again and again took a quarter of the tracing time.
     """
     import jax
 
+    jax.config.update("jax_enable_x64", False)
     gc.freeze()
     folder = cache_folder()
     try:
