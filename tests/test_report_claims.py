@@ -488,6 +488,20 @@ def test_learning_curves_are_of_whole_rounds_of_episodes() -> None:
     np.testing.assert_array_equal(over_rounds(iterations[:2], *(np.ones((1, 2)),) * 2, 99), [[np.nan, 1.0]])
 
 
+def test_intervals_of_learning_curves_cover_what_they_say_and_one_policy_has_none() -> None:
+    returns = np.random.default_rng(1).normal(size=(4, 4000))
+    returns[:2, :1000] = np.nan
+    mean, low, high = LearningCurve("a", np.arange(1.0, 4001.0), returns).mean_with_interval()
+    np.testing.assert_allclose(mean, np.nanmean(returns, axis=0))
+    for some in (slice(1000), slice(1000, None)):
+        assert np.mean((low[some] <= 0) & (high[some] >= 0)) == pytest.approx(0.95, abs=0.02)
+    alone = LearningCurve("a", np.array([1.0, 2.0]), np.array([[5.0, np.nan]]))
+    np.testing.assert_equal(alone.mean_with_interval(), [[5.0, np.nan], [np.nan] * 2, [np.nan] * 2])
+    assert legend(draw_learning_curves([alone], "cartpole")) == {"mean of the policies"}
+    ends = LearningCurve("a", np.array([1.0]), np.array([[120.0], [-91.0]]), within=(-219.0, 120.0))
+    assert ends.mean_with_interval()[:, 0].tolist() == [14.5, -219.0, 120.0]
+
+
 def test_an_interval_that_leaves_the_scale_ends_in_an_arrow() -> None:
     rows = [
         (score("cartpole", "a", 5.0, -500.0, 510.0, 0.0, 10.0), np.array([4.0, 6.0])),
