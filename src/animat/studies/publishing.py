@@ -141,8 +141,8 @@ def _summary(study: Study, results: Results, headline: Sequence[Score], picture:
     smallest = p_of_u(0.0, study.policies, study.policies)
     if rows and smallest >= LEVEL:
         sentences.append(
-            f"With {study.policies} policies per side p cannot fall below {smallest:.2g}: this is a first look, not a "
-            "result."
+            f"With {study.policies} policies per side p cannot fall below {smallest:.2g}, unless some have equal "
+            "returns: this is a first look, not a result."
         )
     return Section("Results in short", tuple(sentences), pictures=(picture,), tables=(arms_table(study),))
 
