@@ -68,8 +68,8 @@ CULTURE = {
     "drift": Caption(
         "drift",
         "Above: percentiles of all non-burst responses. Middle: how often the response to each stimulus exceeds their "
-        "median; curves that converge mean that control is lost. Below: the share of bursts. {recordings} "
-        "of about {responses} each.",
+        "median; curves that converge mean that control is lost. Below: the share of bursts, 0 where none can be set "
+        "apart. {recordings} of about {responses} each.",
         ("tables/culture-drift.csv", "tables/culture-conditions.csv"),
     ),
 }
