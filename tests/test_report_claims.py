@@ -87,6 +87,7 @@ def test_one_comparison_is_reported_without_a_count() -> None:
     assert _found_better([not_better]) == "The second arm was not found to be better."
     assert _found_better([better]) == "The second arm was found to be better."
     assert _found_better([better, not_better]) == "In 1 of 2 comparisons the second arm was found to be better."
+    assert "it is not known whether the second arm is better" in _found_better([replace(ROW, outcome=TOO_FEW)] * 2)
 
 
 def test_differing_comparisons_are_named_with_their_outcomes() -> None:
@@ -167,6 +168,7 @@ def test_a_comparison_is_explained_by_its_optima() -> None:
     # Ties can make p smaller: of four equal returns against four larger ones it is 0.013.
     assert "below 0.03, unless some have equal returns: use more policies" in explain(replace(ROW, n=4))
     assert compare(np.zeros(4), np.ones(4)).p_normal < 0.014
+    assert explain(replace(ROW, n=1)).startswith("With 1 policy per side")
     assert "nothing to learn" in explain(replace(ROW, optimum_second=-79.8))
     assert "no optimum" in explain(replace(ROW, optimum_second=None))
     assert "leaves room" in explain(replace(ROW, optimum_second=100.0))
