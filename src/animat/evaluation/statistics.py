@@ -326,6 +326,6 @@ class Verdict:
             least = min(each.wins for each in self.controls.values())
             parts.append(
                 f"the policies outperform every control (p < {OUTPERFORMED_P:g}; their return is larger in at least "
-                f"{100 * least:.0f} % of the pairs of episodes, ties counting half)"
+                f"{math.floor(100 * least + 1e-9)} % of the pairs of episodes, ties counting half)"
             )
         return "; ".join(parts)
