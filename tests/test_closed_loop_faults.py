@@ -170,7 +170,7 @@ RIGHT = Observed(5.0, 0.02, Spikes(np.array([0.0, 0.01, 0.02]), np.array([0, 7, 
         ({"start_s": 5.0005, "stimulus_time_s": np.array([0.0005])}, None),
         # A window after a late stimulus must not be cut off.
         ({"stimulus_time_s": np.array([0.006]), "duration_s": 0.0241}, None),
-        ({"stimulus_time_s": np.array([0.006]), "duration_s": 0.0239}, "a stimulus 5 ms late, but did not observe"),
+        ({"stimulus_time_s": np.array([0.006]), "duration_s": 0.0239}, "a stimulus 5 ms late, but observed no longer"),
         ({"start_s": 5.0005, "stimulus_time_s": np.array([0.0004])}, "a stimulus 0.1 ms before"),
         ({"duration_s": 0.02 - 5e-7, "spikes": Spikes(np.empty(0), np.empty(0, int))}, None),
         ({"duration_s": 0.02 - 2e-6, "spikes": Spikes(np.empty(0), np.empty(0, int))}, "where 0.02 s from 5.0 s were"),

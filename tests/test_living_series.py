@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
+from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 
@@ -202,13 +203,17 @@ def test_devices_are_recorded_by_the_same_calls(
 ) -> None:
     device, pulses_s = make(monkeypatch)
     protocol = replace(SHORT, pulse=CL1_PULSE if make is cl1 else BALANCED_PULSE)
+    began = datetime.now(UTC).replace(microsecond=0)
     with device as culture:
         zero_s = culture.now_s
         first = record_series(lambda: culture, protocol, tmp_path, sessions=2, interval_min=0.5)
     with device as culture:
         series = record_series(lambda: culture, protocol, tmp_path, sessions=3, interval_min=0.5)
     assert series.files[:2] == first.files
-    assert [r.start_min - zero_s / 60 for r in read_recordings(tmp_path)] == pytest.approx([0, 0.5, 1.0], abs=0.01)
+    recordings = read_recordings(tmp_path)
+    assert [r.start_min - zero_s / 60 for r in recordings] == pytest.approx([0, 0.5, 1.0], abs=0.01)
+    dates = [datetime.fromisoformat(recording.provenance["recorded_at"]) for recording in recordings]
+    assert [began, *dates] == sorted([began, *dates]) and dates[-1] <= datetime.now(UTC)
     assert len(pulses_s()) == 3 * 10
 
 

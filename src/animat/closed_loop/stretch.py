@@ -112,8 +112,7 @@ def check_answer(
         if bool((late_s < -1.5 * sample_s).any()):
             return f"the culture returned a stimulus {-1000 * late_s.min():.3g} ms before its requested time"
         if len(late_s) and seen_s < since_s + duration_s - start_s + late_s[-1] - _MOST_CUT_S:
-            late = f"{1000 * late_s[-1]:.3g} ms late"
-            return f"the culture delivered a stimulus {late}, but did not observe longer by as much after it"
+            return f"the culture delivered a stimulus {1000 * late_s[-1]:.3g} ms late, but observed no longer after it"
         if channel.dtype.kind not in "iu":
             return f"the culture returned channels that are not whole numbers ({channel.dtype})"
         if len(channel) and not (channel.min() >= 0 and channel.max() < n_channels):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import abc
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
+from datetime import UTC, datetime
 from inspect import getattr_static
 from itertools import chain
 from types import FunctionType
@@ -205,6 +206,9 @@ class Culture(Openable):
         """
         schedule, progress = self.schedule(protocol, seed), progress or Silent()
         provenance = {**self.provenance, "protocol_seed": str(seed)}
+        if self.device is not None:
+            # Others are the same whenever they are made.
+            provenance["recorded_at"] = datetime.now(UTC).isoformat(timespec="seconds")
         self._rehearse(schedule)
         about = {"channels": self.channels, "culture": self.recorded_as, "provenance": provenance}
         start_min, rate_hz, before = self.now_s / 60, self.sampling_rate_hz, self.left_out

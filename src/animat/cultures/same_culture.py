@@ -61,10 +61,7 @@ def _other_virtual(recording: Recording, culture: VirtualCulture) -> tuple[str, 
 
 
 def other_channels(recording: Recording, culture: Culture) -> Finding | None:
-    """A warning where an open culture reads other electrodes than were recorded; else, or if those are unknown, None.
-
-    On a MaxOne some of the selected electrodes may not be routed, and not the same ones each time.
-    """
+    """A warning where an open culture reads other electrodes than were recorded; None otherwise, or if not known."""
     recorded = recording.channels.electrode
     different = len(np.setxor1d(recorded, culture.channels.electrode))
     if not different or np.any(recorded == UNKNOWN):
