@@ -230,7 +230,7 @@ def test_a_session_on_a_simulation_is_not_lost_if_the_optimal_return_fails(
     def fail(*_: Any, **__: Any) -> Any:
         raise MemoryError("no room")
 
-    monkeypatch.setattr("animat.reality_gap.optimum.optimal_values", fail)
+    monkeypatch.setattr("animat.reality_gap.running.optimal_values", fail)
     of = {"p0": policy_of(0, series)}, FakeCulture(), Calibration.of_series(series)
     # On a device the optimal return is computed before the loop begins.
     with of[1], pytest.raises(MemoryError):

@@ -18,8 +18,7 @@ from animat.closed_loop.agents import Agent, Controller
 from animat.closed_loop.log import Record
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.runner import runner_of
-from animat.closed_loop.stopping import Stop, ending_of
-from animat.closed_loop.stretch import Request, Stretch, check_answer, read_response, stretch_record
+from animat.closed_loop.stretch import Request, Stop, Stretch, check_answer, ending_of, read_response, stretch_record
 from animat.closed_loop.tick import EndedBy, Ending, Handled, Tick
 from animat.closed_loop.timing import Clock
 from animat.coding.encoder import Dealer

@@ -26,8 +26,7 @@ from animat.closed_loop.header import FORMAT, observed_columns, read_header
 from animat.closed_loop.log import LogWriter, Record
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.outline import Outline
-from animat.closed_loop.session import Session, expect_no_session
-from animat.closed_loop.session_data import LOG_FILE
+from animat.closed_loop.session import LOG_FILE, Session, expect_no_session
 from animat.closed_loop.tick import STOP_FILE, Ending
 from animat.closed_loop.timing import Clock, drop_real_time_priority, real_time_priority
 from animat.ctrl_c import KILLS, handled

@@ -1,4 +1,4 @@
-"""A stretch of time of a closed loop: the request to the culture, the check of its answer, and the response."""
+"""A stretch of time of a closed loop: the request, the check of its answer, the response, or an early ending."""
 
 from __future__ import annotations
 
@@ -12,11 +12,22 @@ from jaxtyping import Bool, Float64, Int64
 
 from animat.closed_loop.log import Record
 from animat.closed_loop.loop import Loop
+from animat.closed_loop.tick import Ending
+from animat.cultures.base import Culture
 from animat.cultures.failures import describe_error
 from animat.cultures.observed import Observed
+from animat.errors import UnsafeStimulus
 from animat.recordings.recording import Channels
 from animat.responses.windows import read_windows
 from animat.stimulation.stimulus import Stimulus
+
+
+class Stop(Exception):
+    """The session ends before its plan is completed."""
+
+    def __init__(self, ending: Ending) -> None:
+        super().__init__(ending.message)
+        self.ending = ending
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,6 +127,25 @@ def check_answer(
     except Exception as error:
         return f"the culture returned something that cannot be read: {describe_error(error)}"
     return None
+
+
+def ending_of(error: Exception, culture: Culture, is_stopped: bool) -> Ending:
+    """The ending for an error of the culture; `is_stopped`: whether a person had stopped it before."""
+    if is_stopped:
+        return Ending("person", "stopped by a person")
+    if isinstance(error, UnsafeStimulus) and error.limit in ("stimuli_per_session", "net_charge_per_session"):
+        return Ending("budget", str(error))
+    if isinstance(error, UnsafeStimulus) and culture.is_stopped:
+        return Ending("culture", f"the culture was stopped: {error}")
+    lost = "the connection to the culture is lost: " if _is_lost(error) else "the culture raised "
+    return Ending("culture", lost + describe_error(error))
+
+
+def _is_lost(error: BaseException | None) -> bool:
+    """Whether an error comes from a lost connection; a timeout does not, as the device is still there."""
+    if error is None:
+        return False
+    return (isinstance(error, OSError) and not isinstance(error, TimeoutError)) or _is_lost(error.__cause__)
 
 
 def read_response(

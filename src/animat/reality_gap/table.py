@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from animat.closed_loop.loop import Loop
-from animat.closed_loop.session import Session, unanswered_message
-from animat.closed_loop.session_data import describe_left_out
+from animat.closed_loop.session import Session, describe_left_out, unanswered_message
 from animat.columns import align_columns
 from animat.cultures.budget import Account
 from animat.errors import in_min

@@ -16,7 +16,7 @@ from PIL import Image
 
 from animat.closed_loop.header import Header, read_header
 from animat.closed_loop.log import Record
-from animat.closed_loop.session_data import LOG_FILE, RECORDING_FILE
+from animat.closed_loop.session import LOG_FILE, RECORDING_FILE
 from animat.closed_loop.tick import STOP_FILE
 from animat.coding.mapping import Thresholds
 from animat.errors import InvalidArgument, InvalidFile, as_invalid_file
