@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-from animat.errors import InvalidArgument, InvalidFile, LoopEnded, did_you_mean, expect_at_least, within
+from animat.errors import InvalidArgument, InvalidFile, LoopEnded, did_you_mean, within
 
 if TYPE_CHECKING:
     from animat.closed_loop.session import Session
@@ -109,10 +109,6 @@ class StimulationOptions(FolderCommand):
     default: 10 with one pulse and adaptive thresholds, else 0"""
     patience_s: float = 10.0
     """Seconds beyond the expected time that a culture, robot or agent may take before the session ends"""
-
-    def _expect_culture_seed(self) -> None:
-        """Raise for a negative seed, under the option's name: later it would be called `seed`, as the policies' is."""
-        expect_at_least("--culture-seed", self.culture_seed, 0)
 
     def _loop_settings(self) -> dict[str, Any]:
         names = ("on_burst", "on_late", "pause_s", "warm_up", "settling", "patience_s")

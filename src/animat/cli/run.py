@@ -145,7 +145,8 @@ class Run(StimulationOptions):
 
         check_episodes("--episodes", self.episodes)
         expect_at_least("--seed", self.seed, 0)
-        self._expect_culture_seed()
+        # Later it would be called `seed`, as the policies' is.
+        expect_at_least("--culture-seed", self.culture_seed, 0)
         policies = policies_for(self.robot, self.mapping, self.policies)
         first = check_policies(policies)
         if not self.recordings:

@@ -90,7 +90,6 @@ class Agent:
 
     Attributes:
         name: unique in its session.
-        meaning: a short description.
         controller: chooses the conditions; several, by name, take turns, one episode each: a control then represents
             all policies, not one of them.
         delivery: as for a control (`animat.evaluation.controls.Control`). `"silent"`: spontaneous activity is read in

@@ -79,7 +79,6 @@ class Header:
         sampling_rate_hz: of the culture; NaN: unknown.
         start_min: start of the session on the culture's clock.
         recorded_at: when it began, ISO 8601.
-        conditions: their labels.
         observed: the columns of the robot's observation, with their units.
         loop: all settings, as JSON.
         readouts: names of the groups of channels that were read; none where all channels were read as one.

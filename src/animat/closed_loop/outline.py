@@ -16,7 +16,6 @@ class Episode:
     Attributes:
         start: the observation before the first step; empty in older logs, which do not have it.
         total: the sum of rewards, in the task's own units.
-        iterations: of the robot.
         terminated: whether it ended by itself and not at the limit.
         is_whole: whether it was completed; an episode that the session cut short has no return.
         pulses: that the culture received.
@@ -46,7 +45,6 @@ class Outline:
     Attributes:
         left_out: what the culture's device reported and the session lacks, by kind; known at the end.
         late: ticks whose pulses came late.
-        latest_s: the largest lateness.
         moved_at_s: when a robot first moved, on the clock of `wall_s`; None before.
         answered: the last stretch of time that the culture answered; -1 before.
         moving: the last episode in which a robot moved; None before.

@@ -31,31 +31,8 @@ class Stop(Exception):
 
 
 @dataclass(frozen=True, eq=False)
-class Request:
-    """A request to the culture for a stretch of time, numbered from 0; it is logged even if no answer comes.
-
-    Attributes:
-        at_s: time of the request, on the session's clock.
-        stimuli: their times count from `at_s`.
-    """
-
-    stretch: int
-    at_s: float
-    stimuli: tuple[Stimulus, ...]
-
-    def to_dict(self) -> dict[str, Any]:
-        """The fields of its record."""
-        return {
-            "stretch": self.stretch,
-            "asked_at_s": self.at_s,
-            "asked_for_s": [stimulus.time_s for stimulus in self.stimuli],
-            "stimuli": rows_of(self.stimuli),
-        }
-
-
-@dataclass(frozen=True, eq=False)
 class Stretch:
-    """What was observed in a stretch of time; times are on the session's clock, rounded to the culture's samples."""
+    """What was observed in a stretch of time, numbered from 0; times are on the session's clock, rounded to samples."""
 
     number: int
     start_s: float
@@ -66,7 +43,13 @@ class Stretch:
     stimulus_time_s: Float64[np.ndarray, " stimuli"]
 
 
-def rows_of(stimuli: Sequence[Stimulus]) -> list[list[Any]]:
+def request_fields(number: int, at_s: float, stimuli: Sequence[Stimulus]) -> dict[str, Any]:
+    """The fields of a request for a stretch of time, logged even if no answer comes; its times count from `at_s`."""
+    times_s = [stimulus.time_s for stimulus in stimuli]
+    return {"stretch": number, "asked_at_s": at_s, "asked_for_s": times_s, "stimuli": _rows_of(stimuli)}
+
+
+def _rows_of(stimuli: Sequence[Stimulus]) -> list[list[Any]]:
     """Stimuli as rows of plain data; their times are in the tick."""
     return [[s.frequency_hz, s.pattern, s.presentation, list(s.electrodes)] for s in stimuli]
 
@@ -74,7 +57,7 @@ def rows_of(stimuli: Sequence[Stimulus]) -> list[list[Any]]:
 def stretch_record(stretch: Stretch, stimuli: Sequence[Stimulus], tick: dict[str, Any] | None) -> Record:
     """The log record of a stretch of time."""
     span = {"stretch": stretch.number, "start_s": stretch.start_s, "duration_s": stretch.duration_s}
-    fields = {"kind": "seen", **span, "stimuli": rows_of(stimuli), "tick": tick}
+    fields = {"kind": "seen", **span, "stimuli": _rows_of(stimuli), "tick": tick}
     return Record(fields, stretch.spike_times_s, stretch.spike_channels)
 
 

@@ -35,7 +35,6 @@ class RealityGap:
         rows: all policies together first, then each of them if there are several, then the controls.
         findings: differences between loop, recording and policies, and other warnings and notes.
         responses: number of the recording's responses, without bursts.
-        outlook: the length of the session as expected beforehand.
         reasons: why the policies' measured return differs from the predicted one, as far as the session's data show.
         whose_work: the policies' return with something in place of the culture; empty if it was not requested.
     """
