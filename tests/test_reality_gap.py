@@ -39,11 +39,11 @@ from animat.neurons.simulator import NeuronSimulator, fit_empirical, pooled_perc
 from animat.neurons.synthetic import LABELS, MEANS_HZ
 from animat.neurons.timeline import Kind, fit_timeline
 from animat.reality_gap import Calibration, RealityGap, Row, check_policies, run_policies
-from animat.reality_gap.interventions import intervention_table
 from animat.reality_gap.predicting import EPISODES, ROLL_OUTS, roll_out_seed
 from animat.reality_gap.row import resampled_means
 from animat.reality_gap.running import planned_episodes
 from animat.reality_gap.session_responses import read_responses
+from animat.reality_gap.table import intervention_table
 from animat.recordings.findings import Finding, warnings_once
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.recorded_culture import RecordedCulture

@@ -34,13 +34,12 @@ from animat.goals.tally import Outcome
 from animat.neurons.simulator import NeuronSimulator
 from animat.progress import Progress, in_phase
 from animat.reality_gap.calibration import Calibration
-from animat.reality_gap.interventions import EPISODES, intervention_table
 from animat.reality_gap.outlook import outlook
 from animat.reality_gap.predicting import BOOTSTRAPS_ON_HOST, ROLL_OUTS, Prediction, episodes_on_host, pool, predict
 from animat.reality_gap.reasons import Evidence, reasons
 from animat.reality_gap.row import Row, bootstrap_interval
 from animat.reality_gap.session_responses import outcomes, read_responses
-from animat.reality_gap.table import RealityGap
+from animat.reality_gap.table import INTERVENTION_EPISODES, RealityGap, intervention_table
 from animat.recordings.findings import Finding, warnings_once
 from animat.robots.base import lacking
 from animat.robots.grid import grid_for, why_no_grid
@@ -137,7 +136,7 @@ def run_policies(
             raise InvalidArgument(
                 f"--interventions: expected a robot in JAX, got {loop.robot.name}, which is stepped on the host"
             )
-        simulated = {"episodes": EPISODES, "seed": seed}
+        simulated = {"episodes": INTERVENTION_EPISODES, "seed": seed}
         half_way = trained.run(environment, simulator, **simulated).half_way
         actuator, *changed = interventions_of(environment, simulator, networks, switch_at=half_way)
         ideal = actuator, actuator.run(environment, simulator, **simulated).returns.ravel()
