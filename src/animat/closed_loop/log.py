@@ -88,7 +88,6 @@ class LogWriter:
         os.fsync(self._file)
 
     def close(self) -> None:
-        """Close the file."""
         os.close(self._file)
 
     def _write(self, data: bytes) -> None:

@@ -98,7 +98,6 @@ class Row:
         return -1 if gap.high < 0 else 1 if gap.low > 0 else 0
 
     def to_dict(self) -> dict[str, Any]:
-        """The row as plain data."""
         measured = bool(len(self.measured))
         return {
             "name": self.name,

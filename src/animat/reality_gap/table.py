@@ -49,7 +49,6 @@ class Intervention:
     lost: Interval
 
     def to_dict(self) -> dict[str, Any]:
-        """As plain data."""
         return vars(self) | {"lost": as_json(self.lost.to_dict())}
 
 
@@ -116,7 +115,6 @@ class RealityGap:
         return f"{text}, and nothing in the session's data explains it (looked for: {', '.join(CHECKS)})"
 
     def to_dict(self) -> dict[str, Any]:
-        """Everything as plain data."""
         return {
             "robot": self.loop.robot.name,
             "mapping": self.loop.mapping.name,
@@ -216,7 +214,6 @@ def intervention_table(
 
 
 def _intervention_lines(policies: Row, table: Sequence[Intervention]) -> list[str]:
-    """The table as lines for a terminal."""
     cells = []
     for each in table:
         where = "measured" if each.is_measured else "simulator"

@@ -63,7 +63,6 @@ class TuningResult:
     importance: Mapping[str, float]
 
     def to_dict(self) -> dict[str, Any]:
-        """The result as plain data."""
         rows = [
             {**asdict(final), "mean_return": None if final.returns is None else final.mean,
              "standard_error": final.standard_error}

@@ -40,7 +40,6 @@ class Tail:
         return len(self._places) - 1
 
     def close(self) -> None:
-        """Close the file."""
         if self._file is not None:
             os.close(self._file)
             self._file = None
