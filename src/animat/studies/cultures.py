@@ -19,8 +19,9 @@ from animat.errors import AnimatError, counted
 from animat.execution.cluster import Cluster
 from animat.execution.gpu import find_gpu
 from animat.execution.jobs import expect_workers
-from animat.execution.pinned import PinnedProcesses, own_cores
+from animat.execution.pinned import PinnedProcesses
 from animat.folders import expect_no_other
+from animat.process import own_cores
 from animat.progress import Progress, Silent
 from animat.report.headline import draw_over_cultures
 from animat.report.html import Section, cell, columns_of, picture_of, table_of, write_page
