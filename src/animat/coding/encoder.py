@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Int64
 
 from animat.arguments import checked_arguments
 from animat.errors import InvalidArgument, UnusableData, shown
 from animat.responses.condition import RESTING, Condition
+from animat.stimulation.patterns import Patterns
 from animat.stimulation.stimulus import NOTHING
 from animat.tables import UNKNOWN
 
@@ -89,9 +89,7 @@ class Dealer:
     empty, so that all are used equally often, and frequencies at random.
     """
 
-    def __init__(
-        self, encoder: Encoder, patterns: Int64[np.ndarray, "patterns size"], rng: np.random.Generator
-    ) -> None:
+    def __init__(self, encoder: Encoder, patterns: Patterns, rng: np.random.Generator) -> None:
         self._encoder, self._rng = encoder, rng
         # In the order of a condition's electrodes, so that the same pattern is the same target.
         rows = (tuple(sorted(e for e in row if e != UNKNOWN)) for row in patterns.tolist())

@@ -110,7 +110,7 @@ def train(
         if not is_ours(folder, manifest):
             write_description(folder, manifest)
         missing = [group for group in groups if not _is_trained(group, folder)]
-        curves = Curves(folder, [group.members for group in groups], callbacks, _phase_of(missing, progress))
+        curves = Curves(folder, groups, callbacks, _phase_of(missing, progress))
         if missing:
             tasks = [TrainGroup(group, checkpoint_s, writes_rows=bool(callbacks)) for group in missing]
             left = [Job(as_range(task.group.members), task, cost_s=CHUNKS * len(task.group.members)) for task in tasks]
@@ -184,7 +184,7 @@ def _train_in_memory(
 ) -> dict[str, Policy]:
     """Train the groups in this process, one after the other."""
     trained: dict[str, Policy] = {}
-    curves = Curves(None, [group.members for group in groups], callbacks, progress)
+    curves = Curves(None, groups, callbacks, progress)
     for number, group in enumerate(groups):
         part = Part(progress, number * CHUNKS, CHUNKS, len(groups) * CHUNKS)
         add_chunk = partial(curves.add, group.members) if callbacks else None

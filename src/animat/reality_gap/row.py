@@ -11,6 +11,9 @@ from jaxtyping import Float64, Int64
 from animat.evaluation.statistics import CONFIDENCE, EpisodeComparison, Interval
 from animat.records import as_json
 
+Returns = Float64[np.ndarray, " episodes"]
+Turns = Int64[np.ndarray, " episodes"]
+"""The return of each episode, and which of its agent's episodes it is."""
 _RESAMPLES = 10_000
 
 
@@ -129,9 +132,7 @@ def bootstrap_interval(value: float, drawn: Float64[np.ndarray, " draws"]) -> In
 
 
 def resampled_means(
-    returns: Float64[np.ndarray, " episodes"],
-    rng: np.random.Generator,
-    turn: Int64[np.ndarray, " episodes"] | None = None,
+    returns: Returns, rng: np.random.Generator, turn: Turns | None = None
 ) -> Float64[np.ndarray, " resamples"] | None:
     """Means of bootstrap samples of returns, spread as far as Student's t is beyond the normal distribution.
 

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64, Int64
 
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.session import Session, describe_left_out, unanswered_message
@@ -20,7 +19,7 @@ from animat.goals.robot import objectives_of
 from animat.goals.tally import MEANS, cells_of, satisfaction_line
 from animat.reality_gap.outlook import Outlook
 from animat.reality_gap.reasons import CHECKS
-from animat.reality_gap.row import Row, resampled_means
+from animat.reality_gap.row import Returns, Row, Turns, resampled_means
 from animat.recordings.findings import Finding
 from animat.records import as_json
 from animat.tables import briefly
@@ -192,9 +191,7 @@ class RealityGap:
         return "\n".join(lines)
 
 
-def intervention_table(
-    rows: Sequence[Row], ideal: Control, with_ideal: Float64[np.ndarray, " episodes"]
-) -> tuple[Intervention, ...]:
+def intervention_table(rows: Sequence[Row], ideal: Control, with_ideal: Returns) -> tuple[Intervention, ...]:
     """The table: the simulator, an ideal actuator with its returns on it, then the measured interventions.
 
     The session's rows have the policies first; without a complete episode of theirs it is empty.
@@ -226,7 +223,7 @@ def _intervention_lines(policies: Row, table: Sequence[Intervention]) -> list[st
     ]
 
 
-def _lost(usual: Row, changed: Float64[np.ndarray, " others"], turn: Int64[np.ndarray, " others"] | None) -> Interval:
+def _lost(usual: Row, changed: Returns, turn: Turns | None) -> Interval:
     """Difference of means, with its interval over episodes (`resampled_means`); infinite where they are too few."""
     value, rng = float(usual.measured.mean() - changed.mean()), np.random.default_rng(0)
     one, other = resampled_means(usual.measured, rng, usual.turn), resampled_means(changed, rng, turn)
