@@ -171,11 +171,9 @@ class Driver:
             for condition in self._rng.permutation(len(self.loop.conditions)).tolist():
                 self._present(agent, episode, -1, condition, condition, 0)
 
-    def _choose(self, agent: Agent, controller: Controller, observation: Float64[np.ndarray, " observations"]) -> int:
+    def _choose(self, agent: Agent, controller: Controller, seen: Float64[np.ndarray, " observed"]) -> int:
         n = len(self.loop.conditions)
-        chosen = self._answer_of(
-            agent.name, "controller", lambda: operator.index(controller.act(observation, self._rng))
-        )
+        chosen = self._answer_of(agent.name, "controller", lambda: operator.index(controller.act(seen, self._rng)))
         if not 0 <= chosen < n:
             raise Stop(Ending("controller", f"{agent.name} chose {chosen}: expected a condition from 0 to {n - 1}"))
         return chosen

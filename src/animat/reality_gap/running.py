@@ -231,7 +231,8 @@ def _warnings(first: Policy, loop: Loop, calibration: Calibration, now_min: floa
             "delivers what they choose"
         )
         yield Finding("trained-as-control", "warning", message)
-    if calibration.simulator.has_memory and loop.pulses == 1 and not loop.warm_up:
+    has_memory = calibration.simulator.has_memory
+    if has_memory and loop.pulses == 1 and not loop.warm_up:
         message = (
             "episodes begin after a rest (--warm-up 0), but on the simulator as after stimuli of all conditions: the "
             "measured return may differ from the prediction"
@@ -246,9 +247,7 @@ def _warnings(first: Policy, loop: Loop, calibration: Calibration, now_min: floa
     yield from transfer.other_simulator(first.fitted, calibration.fitted)
     yield from transfer.other_culture(first.culture, calibration.culture)
     yield from transfer.old_calibration(calibration.start_min, now_min)
-    yield from transfer.no_memory(
-        calibration.findings, calibration.presentation, has_memory=calibration.simulator.has_memory
-    )
+    yield from transfer.no_memory(calibration.findings, calibration.presentation, has_memory=has_memory)
     if isinstance(loop.robot, HostRobot):
         episodes_predicted = ROLL_OUTS * episodes_on_host(loop.robot)
         message = (

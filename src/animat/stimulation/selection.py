@@ -183,13 +183,11 @@ def select_electrodes(
         )
     worth = (scan.amplitude_uv * scan.excitatory_score)[recording]
     stimulation = recording[np.lexsort((scan.electrode[recording], -worth))][: rule.stimulation_sites]
-    electrodes = np.sort(scan.electrode[stimulation])
+    chosen = np.sort(scan.electrode[stimulation])
     patterns = draw_patterns(
-        array, electrodes, seed=seed, patterns=rule.patterns, size=rule.pattern_size, spacing_um=rule.pattern_spacing_um
+        array, chosen, seed=seed, patterns=rule.patterns, size=rule.pattern_size, spacing_um=rule.pattern_spacing_um
     )
-    return Selection(
-        array, np.sort(scan.electrode[recording]), electrodes, patterns, rule, seed, len(scan), len(passed)
-    )
+    return Selection(array, np.sort(scan.electrode[recording]), chosen, patterns, rule, seed, len(scan), len(passed))
 
 
 def _is_best_nearby(

@@ -55,14 +55,12 @@ class StudyView(View):
             ("time left", time_left(self._speed.left_s(sum(costs.values()) - worked), state)),
         ]
         results = _results_table(self.folder, "two-thirds" if is_done else "whole")
-        done_rows = list(done.items())[-_MOST_SHOWN:]
-        done_table = table("Done", ["job", "files"], done_rows, width="whole" if is_done else "half")
+        last = list(done.items())[-_MOST_SHOWN:]
+        finished = table("Done", ["job", "files"], last, width="whole" if is_done else "half")
         if is_done:
-            return in_blocks(state, [facts("Jobs", rows), results, done_table])
-        waiting_table = table("Waiting", ["job"], [[name] for name in waiting[:_MOST_SHOWN]])
-        return in_blocks(
-            state, [facts("Jobs", rows, _FAILED), running_table(running), results, done_table, waiting_table]
-        )
+            return in_blocks(state, [facts("Jobs", rows), results, finished])
+        planned = table("Waiting", ["job"], [[name] for name in waiting[:_MOST_SHOWN]])
+        return in_blocks(state, [facts("Jobs", rows, _FAILED), running_table(running), results, finished, planned])
 
 
 def _share_of(folder: Path) -> float:
