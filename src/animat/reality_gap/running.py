@@ -49,7 +49,7 @@ from animat.wrappers import NeuralObservation
 
 FEWEST_OF_A_CONTROL = 5
 """Fewest episodes of a control: enough to show (p < 0.01) that policies with ten or more outperform it."""
-RESOLUTION = 0.5
+_RESOLUTION = 0.5
 """Of the optimum's grid: fast and coarse, with an error of 0.8 on the range of 200 of the cartpole."""
 
 
@@ -278,7 +278,7 @@ def _begin_optimum(environment: Animat[Any], simulator: NeuronSimulator) -> Futu
     def work() -> None:
         try:
             # Only the value, which is reported as "about": its uncertainty would take a third longer.
-            grid = grid_for(environment.robot).scaled(RESOLUTION)
+            grid = grid_for(environment.robot).scaled(_RESOLUTION)
             (value,), _ = optimal_values([(environment, simulator)], grid, seed=1)
             optimum.set_result(float(value))
         except BaseException as error:
