@@ -6,11 +6,11 @@ import abc
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-from animat.errors import InvalidArgument, InvalidFile, LoopEnded, did_you_mean, within
+from animat.errors import InvalidArgument, InvalidFile, LoopEnded
 from animat.process import own_cores
 
 if TYPE_CHECKING:
@@ -144,10 +144,9 @@ def read_sac(pairs: Sequence[str]) -> SAC:
     """The algorithm's settings, with `pairs` in place of its defaults; InvalidArgument for an impossible one."""
     from animat.training.settings import SAC
 
-    numbers, known = read_numbers("--sac", pairs), [field.name for field in fields(SAC)]
-    for name in numbers:
-        if name not in known:
-            near = did_you_mean(name, known)
-            raise InvalidArgument(f"--sac: {name}: no such setting; expected some of {', '.join(known)}{near}")
-    with within("--sac"):
+    numbers = read_numbers("--sac", pairs)
+    try:
         return SAC(**numbers)  # type: ignore[arg-type]
+    except InvalidArgument as error:
+        # An option has no tables, of which a setting could be at the top.
+        raise InvalidArgument(f"--sac: {str(error).replace(' at the top', '')}") from error
