@@ -166,7 +166,7 @@ class Sums:
         self.on_electrode: Counter[int] = Counter()
         self.faults: list[tuple[float | None, str]] = []
         self.percentiles: list[PercentilesSince] = []
-        self._episode, self._total, self._end_s = -1, 0.0, 0.0
+        self._end_s = 0.0
 
     def go_on(self, within_s: float) -> None:
         """Count the records that were added, for at most `within_s`."""
@@ -191,9 +191,8 @@ class Sums:
 
     def _add(self, fields: dict[str, Any]) -> float:
         """Count a record; returns the total of its episode."""
-        self.outline.add(fields)
-        kind, tick = fields["kind"], fields.get("tick")
-        if kind == "seen":
+        episode = self.outline.add(fields)
+        if (kind := fields["kind"]) == "seen":
             self._end_s = float(fields["start_s"]) + float(fields["duration_s"])
             for _, _, _, electrodes in fields["stimuli"]:
                 self.on_electrode.update(electrodes)
@@ -206,13 +205,10 @@ class Sums:
             self.percentiles.append((self._end_s, first_readout(fields["percentiles_hz"])))
             if len(self.percentiles) > _MOST_THRESHOLDS:
                 del self.percentiles[1::2]
-        if kind != "seen" or not tick:
+        if episode is None:
             return math.nan
-        if tick["episode"] != self._episode:
-            self._episode, self._total = tick["episode"], 0.0
-        self._total += tick["reward"] or 0.0
-        self.wall_s = number(tick.get("wall_s"))
-        return self._total
+        self.wall_s = number(fields["tick"].get("wall_s"))
+        return episode.total
 
 
 def first_readout(percentiles: Any) -> list[float | None]:
