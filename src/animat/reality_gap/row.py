@@ -7,6 +7,7 @@ from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float64, Int64
+from scipy.special import ndtri, stdtrit
 
 from animat.evaluation.statistics import CONFIDENCE, EpisodeComparison, Interval
 from animat.records import as_json
@@ -142,14 +143,12 @@ def resampled_means(
 
     Source: the expanded percentile interval of Hesterberg 2015, doi:10.1080/00031305.2015.1089789.
     """
-    from scipy.stats import norm, t
-
     of = np.unique(np.arange(len(returns)) if turn is None else turn, return_inverse=True)[1]
     total, count = np.bincount(of, returns), np.bincount(of)
     n, level = len(count), (1 + CONFIDENCE) / 2
     if n < 2:
         return None
     often = rng.multinomial(n, np.full(n, 1 / n), _RESAMPLES)
-    spread = np.sqrt(n / (n - 1)) * t.ppf(level, n - 1) / norm.ppf(level)
+    spread = np.sqrt(n / (n - 1)) * stdtrit(n - 1, level) / ndtri(level)
     mean = returns.mean()
     return np.asarray(mean + spread * (often @ total / (often @ count) - mean))
