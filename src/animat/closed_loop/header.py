@@ -103,11 +103,7 @@ def observed_columns(robot: Robot[Any]) -> list[str]:
 
 
 def read_header(file: Path, fields: Mapping[str, Any]) -> Header:
-    """The header of a session's log, from the fields of its first record.
-
-    Raises:
-        InvalidFile: naming a field that is missing or invalid.
-    """
+    """The header of a log, from its first record's fields; InvalidFile names one that is missing or invalid."""
     if fields.get("format") != FORMAT:
         raise InvalidFile(f"{file}: expected {FORMAT!r}, got {shown(fields.get('format'))}")
     try:

@@ -171,8 +171,7 @@ class Session:
     def write(self, progress: Progress | None = None) -> None:
         """Write the ticks as a table, and then the recording: if the recording exists, both do.
 
-        Raises:
-            InvalidFile: for an inconsistent log, or if a file cannot be written.
+        Raises InvalidFile for an inconsistent log, or if a file cannot be written.
         """
         with expect_session_log(self.folder / LOG_FILE):
             with atomic_write(self.ticks_file) as partial, partial.open("w", newline="", encoding="utf-8") as file:
@@ -261,9 +260,8 @@ def read_session(path: str | os.PathLike[str]) -> Session:
 def expect_no_session(folder: str | os.PathLike[str]) -> None:
     """Check the folder of a new session, which may be missing.
 
-    Raises:
-        InvalidArgument, Mismatch: if it holds a session, saying what to do with it, a file `STOP`, or other work.
-        InvalidFile: if it is a file, or cannot be written to.
+    Raises InvalidArgument or Mismatch if it holds a session, saying what to do with it, a file `STOP`, or other work,
+    and InvalidFile if it is a file, or cannot be written to.
     """
     folder = Path(folder)
     if (folder / LOG_FILE).exists():

@@ -113,10 +113,8 @@ class TickTable:
     observation if the response did not move the robot. Flags are 0 or 1; patterns and times of several pulses are
     separated by spaces.
 
-    Each group of channels has a column of its `rate_hz` and, if there are several, of its `command`.
-
-    Args:
-        file: open for text, without translation of line ends.
+    Each group of channels has a column of its `rate_hz` and, if there are several, of its `command`. The file is open
+    for text, without translation of line ends.
     """
 
     def __init__(self, file: TextIO, header: Header) -> None:
