@@ -222,6 +222,26 @@ def test_with_few_responses_to_a_condition_there_is_no_optimal_return(tmp_path: 
     assert message in gap.to_text() and "optimal return on this" not in gap.to_text()
 
 
+@pytest.mark.usefixtures("few_bootstraps")
+def test_the_optimal_return_is_waited_for_where_the_budget_ends_the_session(
+    tmp_path: Path, series: list[Responses], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A program that exits while it is computed is killed by a signal."""
+
+    def slow(*_: Any, **__: Any) -> tuple[list[float], None]:
+        while not (tmp_path / "session.nwb").exists():
+            time.sleep(0.01)
+        time.sleep(0.05)
+        return [12.5], None
+
+    monkeypatch.setattr("animat.reality_gap.optimum.optimal_values", slow)
+    monkeypatch.setattr("animat.reality_gap.running.VirtualCulture", FakeCulture)
+    with FakeCulture() as culture:
+        of = {"p0": policy_of(0, series)}, culture, Calibration.of_series(series)
+        gap = run_policies(*of, tmp_path, episodes=1, with_controls=False, account=Account(Budget(pulses=0)))
+    assert (gap.session.ending.by, gap.optimum) == ("budget", 12.5)
+
+
 @pytest.mark.oracle
 @pytest.mark.usefixtures("few_bootstraps")
 def test_a_session_on_a_simulation_is_not_lost_if_the_optimal_return_fails(
