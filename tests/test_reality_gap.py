@@ -234,7 +234,7 @@ def test_the_optimal_return_is_waited_for_where_the_budget_ends_the_session(
         time.sleep(0.05)
         return [12.5], None
 
-    monkeypatch.setattr("animat.reality_gap.optimum.optimal_values", slow)
+    monkeypatch.setattr("animat.reality_gap.running.optimal_values", slow)
     monkeypatch.setattr("animat.reality_gap.running.VirtualCulture", FakeCulture)
     with FakeCulture() as culture:
         of = {"p0": policy_of(0, series)}, culture, Calibration.of_series(series)
