@@ -156,6 +156,11 @@ def test_an_outcome_that_does_not_hold_after_correction_says_so() -> None:
     assert outcomes == [SECOND, f"{SECOND}, not after correction", f"{FIRST}, not after correction", NONE]
 
 
+def test_a_p_that_is_too_long_to_compute_is_not_called_exact() -> None:
+    shown = comparisons_table([replace(ROW, n=n, p_exact=0.5) for n in (100, 101)])
+    assert [row[shown.head.index("p exact")] for row in shown.rows] == [0.5, None]
+
+
 def test_not_finding_a_difference_is_not_called_no_difference() -> None:
     assert "no difference" not in NONE and "0.01" in NONE
 

@@ -17,7 +17,7 @@ from animat.errors import InvalidArgument, counted, shown
 CONFIDENCE = 0.95
 OUTPERFORMED_P = 0.01
 """Policies count as better if p is below this, as in the paper's comparisons."""
-_MOST_PAIRS = 10_000
+MOST_PAIRS = 10_000
 """Pairs of samples up to which p is computed exactly: two groups of 100 take 0.1 s, and time and memory grow fast."""
 
 
@@ -94,7 +94,7 @@ def compare(first: ArrayLike, second: ArrayLike) -> Comparison:
     u_first, p_normal = mann_whitney(a, b)
     ties = len(np.unique(np.concatenate([a, b]))) < len(a) + len(b)
     total = len(a) * len(b)
-    p_exact = p_normal if total > _MOST_PAIRS else _exact_p(a, b)
+    p_exact = p_normal if total > MOST_PAIRS else _exact_p(a, b)
     high, low = (1 - 2 * share for share in _shares_within(u_first / total, len(a), len(b)))
     effect = Interval(1 - 2 * u_first / total, low, high, CONFIDENCE)
     return Comparison(min(u_first, total - u_first), u_first, len(a), len(b), p_normal, p_exact, effect, ties)

@@ -40,7 +40,8 @@ CULTURE = {
     "psth": Caption(
         "post-stimulus time histogram",
         "Mean rate per channel against the time from the stimulus (the last pulse of a trial), over all stimuli of the "
-        "first recording, whose number is given above. Responses are read in the shaded window.",
+        "first recording, whose number is given above. Responses are read in the shaded window. Where stimuli follow "
+        "each other closely, later and earlier peaks are those of other stimuli.",
         ("tables/culture-psth.csv",),
     ),
     "bursts": Caption(
