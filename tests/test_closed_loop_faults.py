@@ -22,8 +22,7 @@ from animat.cli import main
 from animat.closed_loop.agents import Agent, OneCondition
 from animat.closed_loop.log import LogWriter, Record, read_log
 from animat.closed_loop.running import run_session
-from animat.closed_loop.session import Session, read_session, recover_session
-from animat.closed_loop.session_data import LOG_FILE
+from animat.closed_loop.session import LOG_FILE, Session, read_session, recover_session
 from animat.closed_loop.stretch import check_answer
 from animat.cultures.budget import Account, Budget
 from animat.cultures.observed import Observed, Spikes
@@ -168,6 +167,9 @@ RIGHT = Observed(5.0, 0.02, Spikes(np.array([0.0, 0.01, 0.02]), np.array([0, 7, 
         ({"stimulus_time_s": np.array([0.001 - 7e-5])}, None),
         ({"stimulus_time_s": np.array([0.001 - 8e-5])}, "a stimulus 0.08 ms before"),
         ({"start_s": 5.0005, "stimulus_time_s": np.array([0.0005])}, None),
+        # A window after a late stimulus must not be cut off.
+        ({"stimulus_time_s": np.array([0.006]), "duration_s": 0.0241}, None),
+        ({"stimulus_time_s": np.array([0.006]), "duration_s": 0.0239}, "a stimulus 5 ms late, but did not observe"),
         ({"start_s": 5.0005, "stimulus_time_s": np.array([0.0004])}, "a stimulus 0.1 ms before"),
         ({"duration_s": 0.02 - 5e-7, "spikes": Spikes(np.empty(0), np.empty(0, int))}, None),
         ({"duration_s": 0.02 - 2e-6, "spikes": Spikes(np.empty(0), np.empty(0, int))}, "where 0.02 s from 5.0 s were"),

@@ -8,14 +8,12 @@ import subprocess
 import sys
 from pathlib import Path
 
-import jax
-import jax.numpy as jnp
 import numba
 import pytest
 
 import animat
 from animat import compilation, devices
-from animat.compilation import cache_folder, cached_njit, jit_side_by_side
+from animat.compilation import cache_folder, cached_njit
 
 
 def test_what_cannot_be_kept_is_compiled_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -64,12 +62,6 @@ def test_options_of_the_processor_s_compiler_do_not_reach_that_of_a_gpu(monkeypa
     # As in pinned workers, and in commands.
     monkeypatch.setenv("JAX_PLATFORMS", "cpu")
     assert "xla_gpu_deterministic_ops" not in runpy.run_path(compilation.__file__)["COMPILER_OPTIONS"]
-
-
-def test_policies_are_trained_in_32_bits_whatever_the_user_computes_in() -> None:
-    ones = jnp.ones(2)
-    with jax.enable_x64(True):
-        assert jit_side_by_side(lambda x: x + jnp.zeros(3))(ones).dtype == jnp.float32
 
 
 COMPILING = """

@@ -31,13 +31,11 @@ results reproducible to the bit. Options that `XLA_FLAGS` sets are left alone.
 def jit_side_by_side(
     program: Callable[..., Any], in_axes: int | tuple[int | None, ...] = 0, donate_argnums: int | tuple[int, ...] = ()
 ) -> Callable[..., Any]:
-    """Compile a program of one policy, when it is first called, for several policies side by side; in 32 bits."""
+    """Compile a program of one policy, when it is first called, for several policies side by side."""
     import jax
 
     several = jax.vmap(program, in_axes)
-    compiled = jax.jit(several, donate_argnums=donate_argnums, compiler_options=COMPILER_OPTIONS)
-    # Even where the user's own code computes in 64 bits: learners and checkpoints have one precision.
-    return jax.enable_x64(False)(compiled)  # type: ignore[no-any-return]
+    return jax.jit(several, donate_argnums=donate_argnums, compiler_options=COMPILER_OPTIONS)
 
 
 def cache_folder() -> Path:

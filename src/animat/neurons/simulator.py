@@ -306,7 +306,7 @@ def silenced(simulator: NeuronSimulator) -> EmpiricalSimulator:
 
 
 def indifferent(simulator: NeuronSimulator) -> EmpiricalSimulator:
-    """A culture that answers every condition with the pooled responses to all: random spikes at the same rates.
+    """A culture that answers every condition with the responses to all, those to each equally often: random spikes.
 
     Responses at 512 evenly spaced quantiles represent each condition, ignoring the history.
     """

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -12,6 +11,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
 from animat.errors import InvalidArgument
+from animat.process import own_cores
 from animat.progress import Progress, Silent
 from animat.recordings.detection.band import MARGIN_S, band_pass
 from animat.recordings.detection.negative_peaks import find_negative_peaks, median_noise_uv
@@ -78,7 +78,7 @@ def detect_spikes(
     times_s = np.asarray([] if stimulus_time_s is None else stimulus_time_s, np.float64)
     # Simultaneous pulses are one.
     stimulus = np.unique(np.rint((times_s - traces.start_s) * rate_hz)).astype(np.int64)
-    workers = workers or len(os.sched_getaffinity(0))
+    workers = workers or len(own_cores())
     noise_uv, level_uv = _noise_and_level_uv(traces, stimulus, settings, workers)
     length = max(round(settings.chunk_s * rate_hz), 1)
 
