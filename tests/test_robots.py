@@ -88,6 +88,7 @@ def test_a_state_keeps_its_form_so_that_it_can_be_scanned(robot: Robot) -> None:
     assert of_step == of_environment
     # Also in a program of the user's that computes in 64 bits.
     with jax.enable_x64(True):
+        assert robot.reset(jax.random.key(0)) == state
         assert jax.eval_shape(robot.reset, jax.random.key(0)) == jax.eval_shape(lambda: state)
         in_64_bits = jax.eval_shape(robot.step, jax.random.key(1), state, commands_of(robot, 0.3))
     assert in_64_bits == jax.eval_shape(lambda: (after, reward, terminated))
