@@ -25,7 +25,7 @@ from animat.robots.base import Quantity, Robot
 from animat.robots.cartpole import Cartpole
 from animat.robots.grid import Axis, Grid, grid_for
 from animat.robots.navigation import Navigation, NavigationState
-from animat.wrappers import ShuffledDelivery
+from animat.wrappers import ReversedMapping, ShuffledDelivery, YokedDelivery
 
 SIMULATOR = synthetic_simulator()
 
@@ -382,6 +382,9 @@ def test_refusals_say_what_to_do() -> None:
         best_returns([])
     with pytest.raises(Mismatch, match="the same robot in all"):
         best_returns([(environment, SIMULATOR), (Animat(Cartpole(), Thresholds(1), 5), SIMULATOR)])
+    for changed in (YokedDelivery(environment), ReversedMapping(Navigation(), Thresholds(1), 5)):
+        with pytest.raises(InvalidArgument, match=f"got {type(changed).__name__}, whose optimal return is not known"):
+            best_return(ShuffledDelivery(changed), SIMULATOR)
     with pytest.raises(InvalidArgument, match="simulator"):
         best_return(environment, None)
     with pytest.raises(InvalidArgument, match="has no method `value_grid`"):

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from animat.environment import WithoutNeurons
 from animat.errors import InvalidArgument
 from animat.robots import (
     ROBOTS,
@@ -80,8 +81,14 @@ def test_a_state_keeps_its_form_so_that_it_can_be_scanned(robot: Robot) -> None:
     assert [(leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(after)] == [((), jnp.float32)] * len(state)
     assert (reward.shape, reward.dtype) == ((), jnp.float32)
     assert (terminated.shape, terminated.dtype) == ((), jnp.bool_)
+    # So does the state of an environment, whole.
+    environment = WithoutNeurons(robot, None)
+    of_environment = jax.eval_shape(environment.reset, jax.random.key(0))
+    of_step = jax.eval_shape(environment.step, jax.random.key(0), of_environment, commands_of(robot, 0.3), None)
+    assert of_step == of_environment
     # Also in a program of the user's that computes in 64 bits.
     with jax.enable_x64(True):
+        assert robot.reset(jax.random.key(0)) == state
         assert jax.eval_shape(robot.reset, jax.random.key(0)) == jax.eval_shape(lambda: state)
         in_64_bits = jax.eval_shape(robot.step, jax.random.key(1), state, commands_of(robot, 0.3))
     assert in_64_bits == jax.eval_shape(lambda: (after, reward, terminated))

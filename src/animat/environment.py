@@ -209,6 +209,6 @@ class WithoutNeurons(Environment[RobotState]):
         return self.robot.noise_size
 
     def respond(self, uniforms: Uniforms, state: State, action: Array, simulator: Neurons) -> Responded:
-        no_answer = Answer(jnp.float32(jnp.nan), state.neurons)
+        no_answer = Answer(jnp.full(self.robot.command_shape, jnp.nan, jnp.float32), state.neurons)
         command = action if self.commands is None else jnp.asarray(self.commands, jnp.float32)[action]
         return Responded(action, no_answer, jnp.clip(command, -1.0, 1.0))

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64, Int32, UInt16
 
 from animat.arguments import checked_arguments
-from animat.environment import Environment, Neurons
+from animat.environment import Animat, Environment, Neurons, WithoutNeurons
 from animat.errors import InvalidArgument, Mismatch
 from animat.evaluation.commands import CLASSES, class_of, commands_after, is_shuffled, memory_of, nodes_for
 from animat.evaluation.landings import Motion, Outcomes, side_by_side
@@ -24,7 +24,7 @@ from animat.neurons.history import INITIAL_HISTORY
 from animat.progress import Part, Progress, Silent
 from animat.recordings.findings import Finding
 from animat.robots.grid import Grid, grid_for
-from animat.wrappers import TrialCosts, net_reward, unwrapped
+from animat.wrappers import EpisodeLimit, NeuralObservation, ShuffledDelivery, TrialCosts, net_reward, unwrapped
 
 Case = tuple[Environment[Any], Neurons]
 """An environment, and the simulator in it (None without neurons)."""
@@ -143,7 +143,8 @@ def best_returns(
         progress: what to report to.
 
     Raises:
-        InvalidArgument: for no cases, a robot without a grid, or a number that is not positive.
+        InvalidArgument: for no cases, a wrapper or a subclass whose effect is not known, a robot without a grid, or a
+            number that is not positive.
         Mismatch: for cases of different robots.
     """
     if not cases:
@@ -156,6 +157,7 @@ def best_returns(
     for environment, _ in cases:
         if environment.robot != robot:
             raise Mismatch(f"cases: expected the same robot in all, got {robot} and {environment.robot}")
+        _expect_known(environment)
     fine = (grid_for(robot) if grid is None else grid).scaled(resolution)
     coarse = fine.scaled(COARSER, periodic=True)
     progress = Silent() if progress is None else progress
@@ -192,6 +194,19 @@ def optimal_values(
     """Only the values, of many cases on a given grid, and the lowest and the highest possible return."""
     programme = _Programme(grid, cases)
     return programme.run(None, seed, progress or Silent()), programme.bounds
+
+
+def _expect_known(environment: Environment[Any]) -> None:
+    """Refuse an environment that may do what dynamic programming, on the robot's own steps, would not notice."""
+    inmost = environment
+    while isinstance(inmost, EpisodeLimit | NeuralObservation | ShuffledDelivery | TrialCosts):
+        inmost = inmost.inside
+    kind, kinds = type(inmost), (Animat, WithoutNeurons)
+    if (kind.respond, kind.advance) not in [(known.respond, known.advance) for known in kinds]:
+        raise InvalidArgument(
+            "environment: expected an Animat or WithoutNeurons, with a limit, neural observation, shuffled delivery or "
+            f"trial costs at most, got {kind.__name__}, whose optimal return is not known"
+        )
 
 
 # At module level, so that it is compiled once, with the clock and without.

@@ -98,7 +98,8 @@ class Shuttle(Robot[ShuttleState]):
     def reset(self, key: Array) -> ShuttleState:
         """At rest in the middle; the cue is drawn."""
         zero = jnp.zeros((), jnp.float32)
-        return ShuttleState(zero, zero, jnp.where(jax.random.uniform(key) < 0.5, 1.0, -1.0).astype(jnp.float32))
+        cue = jnp.where(jax.random.uniform(key, dtype=jnp.float32) < 0.5, 1.0, -1.0)
+        return ShuttleState(zero, zero, cue.astype(jnp.float32))
 
     def advance(self, uniforms: Uniforms, state: ShuttleState, u: Float[Array, ""]) -> Transition[ShuttleState]:
         kept = math.exp(-self.step_s / self.time_constant_s)

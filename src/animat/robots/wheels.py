@@ -129,7 +129,8 @@ class Wheels(Robot[WheelsState]):
     def reset(self, key: Array) -> WheelsState:
         """At the start, with a random heading and goal."""
         for_goal, for_heading = jax.random.split(key)
-        goal = jnp.asarray(self._goals_m, jnp.float32)[jax.random.randint(for_goal, (), 0, len(self._goals_m))]
+        number = jax.random.randint(for_goal, (), 0, len(self._goals_m), jnp.int32)
+        goal = jnp.asarray(self._goals_m, jnp.float32)[number]
         heading = math.pi * (1 - 2 * jax.random.uniform(for_heading, (), jnp.float32))
         return WheelsState(jnp.float32(self.start_x_m), jnp.float32(self.start_y_m), heading, goal[0], goal[1])
 
