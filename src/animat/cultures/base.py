@@ -6,7 +6,7 @@ import abc
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from inspect import getattr_static
-from itertools import chain
+from itertools import chain, pairwise
 from types import FunctionType
 from typing import Any, ClassVar, final
 
@@ -16,7 +16,6 @@ from jaxtyping import Int64
 from animat.cultures.failures import as_device_failure
 from animat.cultures.observed import Observed, Spikes, assemble, more_left_out, with_rests
 from animat.cultures.openable import Openable
-from animat.cultures.request import Request, plain_duration
 from animat.cultures.safety import SIMULATED_LIMITS, Admitted, Limits
 from animat.errors import AnimatError, InvalidArgument, expect_kind, some_of
 from animat.progress import Progress, Silent
@@ -27,7 +26,7 @@ from animat.stimulation.plain import number, seconds
 from animat.stimulation.protocol import Protocol
 from animat.stimulation.pulse import Pulse
 from animat.stimulation.schedule import Block, Schedule, make_schedule
-from animat.stimulation.stimulus import Stimulus
+from animat.stimulation.stimulus import Stimulus, plain_stimuli
 from animat.tables import UNKNOWN
 
 
@@ -104,18 +103,27 @@ class Culture(Openable):
                 than float64, or a `since_s` that the clock has not reached.
             DeviceFailed: if the device fails meanwhile; with `is_admitted` true, the request may have been delivered.
         """
-        turns, request, admitted = self._opened(), Request.of(stimuli, duration_s), None
+        turns, admitted = self._opened(), None
+        stimuli, duration_s = _plain_request(stimuli, duration_s)
         try:
             with as_device_failure(self.name, "deliver"), turns as guard:
                 now_s = seconds("now_s", self.now_s)
                 if since_s is not None and since_s != now_s:
-                    request = request.counted_from(seconds("since_s", since_s), now_s)
+                    since_s = seconds("since_s", since_s)
+                    if not since_s <= now_s:
+                        expected = f"a reading of the clock, which is at {now_s:g} s"
+                        raise InvalidArgument(f"since_s: expected {expected}, got {since_s}")
+                    # All are moved equally, so that intervals stay as requested; what is overdue begins now. Times
+                    # below 0 are left to the guard.
+                    passed_s = min(now_s - since_s, max(0.0, stimuli[0].time_s) if stimuli else duration_s)
+                    stimuli = [replace(stimulus, time_s=stimulus.time_s - passed_s) for stimulus in stimuli]
+                    duration_s -= passed_s
                 # Rests go neither to the guard nor to the backend.
-                pulses = [stimulus for stimulus in request.stimuli if not stimulus.is_rest]
-                if request.stimuli and not pulses:
+                pulses = [stimulus for stimulus in stimuli if not stimulus.is_rest]
+                if stimuli and not pulses:
                     guard.expect_not_stopped()
                 admitted = guard.admit(pulses, now_s)
-                return with_rests(self._deliver(admitted, request.duration_s), request.stimuli, now_s)
+                return with_rests(self._deliver(admitted, duration_s), stimuli, now_s)
         except AnimatError as error:
             error.is_admitted = admitted is not None and len(admitted.stimuli) > 0
             raise
@@ -132,7 +140,7 @@ class Culture(Openable):
         Raises:
             InvalidArgument, DeviceFailed: as `deliver` does.
         """
-        turns, duration_s = self._opened(), plain_duration(duration_s)
+        turns, duration_s = self._opened(), _plain_duration(duration_s)
         with as_device_failure(self.name, "rest"), turns:
             self._rest(duration_s)
 
@@ -240,6 +248,29 @@ class Culture(Openable):
             offset_s += block.duration_s
         with self._opened() as guard:
             guard.check(pulses, self.now_s)
+
+
+def _plain_request(stimuli: Iterable[Stimulus], duration_s: float) -> tuple[Sequence[Stimulus], float]:
+    """The arguments of a delivery as immutable plain values; refuses anything else, and a stimulus after the end."""
+    stimuli, duration_s = plain_stimuli(stimuli), _plain_duration(duration_s)
+    times_s = [stimulus.time_s for stimulus in stimuli]
+    for time_s in times_s:
+        if not time_s < duration_s:
+            raise InvalidArgument(
+                f"stimuli: expected times before the delivery ends ({duration_s:g} s), got {time_s:g} s"
+            )
+    # The guard checks the times of pulses, and does not see rests.
+    has_rests = any(stimulus.is_rest for stimulus in stimuli)
+    if has_rests and not all(before <= after for before, after in pairwise([0.0, *times_s])):
+        raise InvalidArgument(f"stimuli: expected times from 0 s in ascending order, got {times_s[:5]}")
+    return stimuli, duration_s
+
+
+def _plain_duration(duration_s: float) -> float:
+    duration_s = seconds("duration_s", duration_s)
+    if not 0 <= duration_s < float("inf"):
+        raise InvalidArgument(f"duration_s: expected a finite number of seconds from 0, got {duration_s}")
+    return duration_s
 
 
 _BEFORE_ALL = ("__getattribute__", "__setattr__", "__delattr__", "__copy__", "__deepcopy__")

@@ -12,10 +12,9 @@ from pathlib import Path
 from typing import Any, ClassVar, NoReturn, Self, final
 
 from animat.cultures.failures import as_device_failure, while_open
-from animat.cultures.history import History
 from animat.cultures.holding import hold
 from animat.cultures.limits import Limits, plain_limits
-from animat.cultures.safety import Guard
+from animat.cultures.safety import Guard, History
 from animat.errors import InvalidArgument, UnsafeStimulus
 from animat.stimulation.plain import seconds
 

@@ -15,10 +15,9 @@ from jaxtyping import Int64
 from animat.cultures.base import Culture
 from animat.cultures.devices.cl1_delivery import FRAMES_PER_S, LEAD_US, Session
 from animat.cultures.failures import as_device_failure, describe_error, vendor_module, while_open
-from animat.cultures.history import History
 from animat.cultures.holding import of_the_machine, of_the_program
 from animat.cultures.observed import Observed, Spikes
-from animat.cultures.safety import Admitted, Guard, Limits
+from animat.cultures.safety import Admitted, Guard, History, Limits
 from animat.errors import AnimatError, DeviceFailed, InvalidArgument
 from animat.extras import install_command
 from animat.recordings.formats.cl1_layout import CHANNELS, IDENTIFIERS, NO_STIMULATION, SITES, STIMULUS_STREAM

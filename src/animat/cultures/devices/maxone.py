@@ -19,10 +19,9 @@ from animat.cultures.devices.maxone_sequences import FRAMES_PER_S, INITIAL_DELAY
 from animat.cultures.devices.maxone_stream import AMPLIFIERS, SpikeStream, ZmqSpikes
 from animat.cultures.devices.maxone_wiring import Wiring, wire
 from animat.cultures.failures import as_device_failure, describe_error, once_opened, vendor_module, while_open
-from animat.cultures.history import History
 from animat.cultures.holding import of_the_machine
 from animat.cultures.observed import Observed, observed_in_frames
-from animat.cultures.safety import Admitted, Guard, Limits
+from animat.cultures.safety import Admitted, Guard, History, Limits
 from animat.errors import DeviceFailed, InvalidArgument
 from animat.recordings.recorded_culture import RecordedCulture
 from animat.recordings.recording import Channels
