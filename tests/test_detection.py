@@ -16,10 +16,14 @@ from animat.cultures.traces import Traces, record_traces
 from animat.errors import InvalidArgument, InvalidFile
 from animat.recordings.conversion import read_traces
 from animat.recordings.detection.artefacts import without_artefacts
-from animat.recordings.detection.band import band_pass
-from animat.recordings.detection.negative_peaks import find_negative_peaks, median_noise_uv
 from animat.recordings.detection.settings import Detection
-from animat.recordings.detection.spikes import DetectedSpikes, detect_spikes
+from animat.recordings.detection.spikes import (
+    DetectedSpikes,
+    band_pass,
+    detect_spikes,
+    find_negative_peaks,
+    median_noise_uv,
+)
 from animat.recordings.formats.traces import open_traces
 from animat.recordings.raw import RawTraces, in_microvolts
 from animat.recordings.recording import Channels

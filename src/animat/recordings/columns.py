@@ -11,9 +11,9 @@ from jaxtyping import Float64, Int64
 
 from animat.errors import UnusableData
 from animat.recordings.findings import Finding, merged
-from animat.recordings.gaps import late_start
 from animat.recordings.metadata import culture_of
 from animat.recordings.recording import Channels, Recording
+from animat.recordings.time_quality import late_start
 from animat.stimulation.protocol import Presentation
 from animat.stimulation.stimulus import NOTHING, Stimuli
 from animat.tables import UNKNOWN, expect_times

@@ -1,4 +1,4 @@
-"""Detects spikes in raw traces: first the noise, then piece by piece on all cores, in bounded memory."""
+"""Detects spikes in raw traces as negative peaks, piece by piece on all cores, in bounded memory."""
 
 from __future__ import annotations
 
@@ -6,23 +6,33 @@ import os
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int64
+from jaxtyping import Bool, Float32, Float64, Int64
+from scipy import fft, signal
 
 from animat.errors import InvalidArgument
 from animat.progress import Progress, Silent
-from animat.recordings.detection.band import MARGIN_S, band_pass
-from animat.recordings.detection.negative_peaks import find_negative_peaks, median_noise_uv
 from animat.recordings.detection.pieces import Piece, read_piece
 from animat.recordings.detection.settings import Detection
 from animat.recordings.findings import Finding
 from animat.recordings.raw import RawTraces
 
+ORDER = 3
+MARGIN_S = 0.05
+"""Margin that a piece needs on both sides: the filter's transform is circular, and the resulting transient at its ends
+decays by e in 3 ms at 100 Hz."""
 BLOCK = 64
 """Channels filtered at a time: few enough to fit into the processor's cache."""
 NOISE_PIECES, NOISE_PIECE_S = 15, 0.2
+NOISE_SAMPLES = 2500
+"""Approximate number of samples used per channel."""
+NORMAL = 0.6745
+"""Ratio of the median of |x| to the standard deviation of x for a normal distribution."""
+LEAST_SHARE = 0.1
+"""Share of a channel's samples from which its noise can be estimated."""
 LEVEL_STEP = 20
 """Every so many samples are enough for the median of the voltage."""
 DEAD, NOISY = 0.1, 5.0
@@ -135,10 +145,10 @@ def _noise_and_level_uv(
         for columns in blocks(channels):
             rows = piece.rows(columns)
             level_uv = np.median(rows[:, ::LEVEL_STEP], axis=1)
-            first = median_noise_uv(_filtered(rows, settings, rate_hz)[:, margin:-margin])
+            first = median_noise_uv(band_pass(rows, settings.band_hz, rate_hz)[:, margin:-margin])
             if len(piece.stimulus) or piece.is_lost is not None:
                 cleaned = piece.cleaned(columns, first, level_uv, rate_hz, settings)
-                filtered = _filtered(cleaned.voltage_uv, settings, rate_hz)
+                filtered = band_pass(cleaned.voltage_uv, settings.band_hz, rate_hz)
                 first = median_noise_uv(filtered[:, margin:-margin], cleaned.is_blank[:, margin:-margin])
             medians_uv[:, columns] = first, level_uv
         return medians_uv
@@ -173,7 +183,7 @@ def _search(
     samples, channels, saturation = [], [], np.zeros((len(piece.stimulus), 2))
     for columns in blocks(len(noise_uv)):
         cleaned = piece.cleaned(columns, noise_uv[columns], level_uv[columns], rate_hz, settings)
-        filtered = _filtered(cleaned.voltage_uv, settings, rate_hz)
+        filtered = band_pass(cleaned.voltage_uv, settings.band_hz, rate_hz)
         if cleaned.is_blank.any():
             filtered[cleaned.is_blank] = 0.0
         row, sample = find_negative_peaks(filtered, depth_uv[columns], apart, first, last)
@@ -185,12 +195,85 @@ def _search(
     return _Found(np.concatenate(samples), np.concatenate(channels), piece.first_stimulus, saturation, piece.lost)
 
 
-def _filtered(
-    rows: Float32[np.ndarray, "channels samples"], settings: Detection, rate_hz: float
+def median_noise_uv(
+    voltage_uv: Float32[np.ndarray, "channels samples"], is_blank: Bool[np.ndarray, "channels samples"] | None = None
+) -> Float32[np.ndarray, " channels"]:
+    """Standard deviation of each channel's noise, in filtered traces: median(|v - median(v)|) / 0.6745.
+
+    NaN for a channel of which nearly everything is blanked.
+    """
+    if is_blank is not None and is_blank.any():
+        # A sample counts if no channel is blanked, if there are enough of these.
+        kept, samples = ~is_blank.any(axis=0), voltage_uv.shape[1]
+        if np.count_nonzero(kept) < 0.5 * samples:
+            rows = [row[~blank] for row, blank in zip(voltage_uv, is_blank, strict=True)]
+            least = LEAST_SHARE * samples
+            each = [median_noise_uv(row[None])[0] if len(row) >= least else np.nan for row in rows]
+            return np.array(each, dtype=np.float32)
+        voltage_uv = voltage_uv[:, kept]
+    # Neighbouring samples of a filtered trace are correlated: a subset of them is as informative.
+    voltage_uv = voltage_uv[:, :: max(voltage_uv.shape[1] // NOISE_SAMPLES, 1)]
+    return np.asarray(_median(np.abs(voltage_uv - _median(voltage_uv)[:, None])) / NORMAL, dtype=np.float32)
+
+
+def _median(values: Float32[np.ndarray, "rows values"]) -> Float32[np.ndarray, " rows"]:
+    """The (upper) median of each row by one partition; numpy's does three and takes several times as long."""
+    middle = values.shape[1] // 2
+    return np.asarray(np.partition(values, middle, axis=1)[:, middle], dtype=np.float32)
+
+
+def find_negative_peaks(
+    voltage_uv: Float32[np.ndarray, "channels samples"],
+    depth_uv: Float32[np.ndarray, " channels"],
+    apart: int,
+    first: int,
+    last: int,
+) -> tuple[Int64[np.ndarray, " peaks"], Int64[np.ndarray, " peaks"]]:
+    """Rows and samples of the negative peaks from sample `first` on until `last`.
+
+    A sample t is a peak if v(t) < -depth and v(t) <= v(s) for all s within `apart` samples, at least 1; of equal ones,
+    the first. A channel of infinite depth has none.
+    """
+    inner = voltage_uv[:, first:last]
+    # The neighbourhood is checked for these few samples only.
+    row, column = np.nonzero(inner < -depth_uv[:, None])
+    column = column + first
+    before, after = np.maximum(column - 1, 0), np.minimum(column + 1, voltage_uv.shape[1] - 1)
+    peak_uv = voltage_uv[row, column]
+    low = (peak_uv <= voltage_uv[row, before]) & (peak_uv <= voltage_uv[row, after])
+    row, column, peak_uv = row[low], column[low], peak_uv[low]
+    if not len(row):
+        return row.astype(np.int64), column.astype(np.int64)
+    padded = np.pad(voltage_uv, ((0, 0), (apart, apart)), constant_values=np.inf)
+    around = padded[row[:, None], column[:, None] + np.arange(2 * apart + 1)[None, :]]
+    is_least = np.all(peak_uv[:, None] < around[:, :apart], axis=1)
+    is_least &= np.all(peak_uv[:, None] <= around[:, apart + 1 :], axis=1)
+    return row[is_least].astype(np.int64), column[is_least].astype(np.int64)
+
+
+def band_pass(
+    voltage_uv: Float32[np.ndarray, "channels samples"], band_hz: tuple[float, float] | None, rate_hz: float
 ) -> Float32[np.ndarray, "channels samples"]:
-    if settings.band_hz is None:
-        return np.asarray(rows - np.median(rows, axis=1, keepdims=True), dtype=np.float32)
-    return band_pass(rows, settings.band_hz, rate_hz)
+    """Filter each row, zero-phase, by Fourier transform; `MARGIN_S` at both ends is not usable.
+
+    The gain at frequency f is |H(f)|^2, H being a Butterworth band-pass of order 3 whose |H|^2 is a half at the ends of
+    the band: the result of filtering forwards and backwards, without the two passes. Without a band, for traces that
+    are filtered already, only the median is subtracted.
+    """
+    if band_hz is None:
+        return np.asarray(voltage_uv - np.median(voltage_uv, axis=1, keepdims=True), dtype=np.float32)
+    samples = voltage_uv.shape[1]
+    length = fft.next_fast_len(samples, real=True)
+    spectrum = fft.rfft(voltage_uv, length, axis=1)
+    spectrum *= _gain(length, band_hz, rate_hz)
+    return np.asarray(fft.irfft(spectrum, length, axis=1)[:, :samples], dtype=np.float32)
+
+
+@lru_cache(maxsize=8)
+def _gain(length: int, band_hz: tuple[float, float], rate_hz: float) -> Float32[np.ndarray, " frequencies"]:
+    sections = signal.butter(ORDER, band_hz, "bandpass", fs=rate_hz, output="sos")
+    _, gain = signal.sosfreqz(sections, worN=fft.rfftfreq(length, 1 / rate_hz), fs=rate_hz)
+    return np.asarray(np.abs(gain) ** 2, dtype=np.float32)
 
 
 def _lost(lost: Int64[np.ndarray, " channels"], samples: int) -> Iterator[Finding]:
