@@ -50,11 +50,7 @@ class PlainColumns:
     presentation_pulses: int | None = None
 
     def to_recording(self, provenance: Mapping[str, str], findings: tuple[Finding, ...] = ()) -> Recording:
-        """Check and sort the columns and make a recording from them; findings so far are kept in it.
-
-        Raises:
-            UnusableData: naming the column, what was expected and what came.
-        """
+        """Check and sort the columns and make a recording from them, with the findings so far."""
         for name in ("spike_channel", "channel_label", "stimulus_pattern"):
             dtype = np.asarray(getattr(self, name)).dtype
             # Characters for which every row of a text column has room.
@@ -213,11 +209,7 @@ def columns_of(recording: Recording) -> dict[str, Any]:
 
 
 def with_start(recording: Recording, start_s: float) -> Recording:
-    """The recording with a new start, reported as a finding if it differs, and the same end.
-
-    Raises:
-        UnusableData: if events come before the new start.
-    """
+    """The recording with a new start, reported as a finding if it differs, and the same end; refuses earlier events."""
     duration_s = duration_between(start_s, max(recording.stop_s, start_s))
     is_same = start_s == recording.start_s
     outdated = ("start-unknown",) if is_same else ("start-unknown", "start-given")

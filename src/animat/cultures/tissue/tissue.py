@@ -63,9 +63,6 @@ class Tissue:
         x_um, y_um: position of each neuron along the array's long and short side, shape (neurons,).
         is_excitatory: type of each neuron, shape (neurons,).
         step_ns: the time step.
-
-    Raises:
-        InvalidArgument: for a negative seed.
     """
 
     def __init__(self, seed: int, parameters: TissueParameters | None = None) -> None:
@@ -135,12 +132,7 @@ class Tissue:
         return Snapshot(self.seed, self.parameters, self._now_ns, self._step, self._kicks, state)
 
     def restore(self, snapshot: Snapshot) -> None:
-        """Return to a snapshot; from there the tissue continues bit for bit as it did after it.
-
-        Raises:
-            Mismatch: for a snapshot of another seed or other parameters.
-            InvalidArgument: for a state that no tissue can reach; nothing has then changed.
-        """
+        """Return to a snapshot, from which the tissue continues bit for bit; refuses a state that it cannot reach."""
         if (snapshot.seed, snapshot.parameters) != (self.seed, self.parameters):
             raise Mismatch(
                 f"snapshot: expected one of this tissue (seed {self.seed}), got one of seed {snapshot.seed} or with "

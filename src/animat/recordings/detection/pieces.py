@@ -38,12 +38,6 @@ class Piece:
     first_stimulus: int
     rests_uv: Float32[np.ndarray, "pulses channels"] | None
 
-    @property
-    def owned(self) -> np.ndarray:
-        """Which of its stimuli lie between `start` and `stop`, not in a margin."""
-        at = self.stimulus - self.lead - self.margin
-        return np.asarray((at >= 0) & (at < self.stop - self.start))
-
     def cleaned(
         self,
         columns: slice,
@@ -70,18 +64,6 @@ class Piece:
             voltage_uv=np.ascontiguousarray(cleaned.voltage_uv[:, self.lead :]),
             is_blank=is_blank[:, self.lead :],
         )
-
-    def rows(self, columns: slice) -> Float32[np.ndarray, "channels samples"]:
-        """Some of the channels as recorded, one per row and without the lead."""
-        return np.ascontiguousarray(self.voltage_uv[self.lead :, columns].T)
-
-    @property
-    def lost(self) -> Int64[np.ndarray, " channels"]:
-        """The number of samples of each channel between `start` and `stop` that are not finite."""
-        first = self.lead + self.margin
-        if self.is_lost is None:
-            return np.zeros(self.voltage_uv.shape[1], np.int64)
-        return np.asarray(np.count_nonzero(self.is_lost[first : first + self.stop - self.start], axis=0))
 
 
 def read_piece(traces: RawTraces, stimulus: Int64[np.ndarray, " stimuli"], start: int, stop: int, margin: int) -> Piece:

@@ -42,13 +42,7 @@ MUCH_LOST = 0.01
 
 @dataclass(frozen=True, eq=False)
 class DetectedSpikes:
-    """Detected spikes, in order of time.
-
-    Attributes:
-        time_s: of their negative peaks, on the recording's clock, shape (spikes,).
-        channel: row of the channel table, shape (spikes,).
-        noise_uv: standard deviation of each channel's noise, shape (channels,).
-    """
+    """Spikes in order of time (that of their negative peaks) by row of the channel table, and each channel's noise."""
 
     time_s: Float64[np.ndarray, " spikes"]
     channel: Int64[np.ndarray, " spikes"]
@@ -126,8 +120,7 @@ def is_dead(noise_uv: Float32[np.ndarray, " channels"]) -> np.ndarray:
 
 def blocks(channels: int) -> Iterator[slice]:
     """The columns in blocks."""
-    for first in range(0, channels, BLOCK):
-        yield slice(first, min(first + BLOCK, channels))
+    return (slice(first, first + BLOCK) for first in range(0, channels, BLOCK))
 
 
 def _noise_and_level_uv(
@@ -143,7 +136,7 @@ def _noise_and_level_uv(
         medians_uv = np.zeros((2, channels), np.float32)
         piece = read_piece(traces, stimulus, start, min(start + length, traces.samples), margin)
         for columns in blocks(channels):
-            rows = piece.rows(columns)
+            rows = np.ascontiguousarray(piece.voltage_uv[piece.lead :, columns].T)
             level_uv = np.median(rows[:, ::LEVEL_STEP], axis=1)
             first = median_noise_uv(band_pass(rows, settings.band_hz, rate_hz)[:, margin:-margin])
             if len(piece.stimulus) or piece.is_lost is not None:
@@ -180,6 +173,10 @@ def _search(
     depth_uv = np.where(is_dead(noise_uv), np.inf, settings.threshold * noise_uv).astype(np.float32)
     apart = max(round(settings.dead_time_ms * 1e-3 * rate_hz), 1)
     first, last = piece.margin, piece.margin + piece.stop - piece.start
+    is_owned = (piece.stimulus >= piece.lead + first) & (piece.stimulus < piece.lead + last)
+    lost = np.zeros(len(noise_uv), np.int64)
+    if piece.is_lost is not None:
+        lost = np.count_nonzero(piece.is_lost[piece.lead + first : piece.lead + last], axis=0)
     samples, channels, saturation = [], [], np.zeros((len(piece.stimulus), 2))
     for columns in blocks(len(noise_uv)):
         cleaned = piece.cleaned(columns, noise_uv[columns], level_uv[columns], rate_hz, settings)
@@ -190,9 +187,9 @@ def _search(
         samples.append(sample - first + piece.start)
         channels.append(row + columns.start)
         # Channels are counted only in the piece that a pulse starts in; the duration is seen in any of them.
-        saturation[:, 0] += cleaned.saturated * piece.owned
+        saturation[:, 0] += cleaned.saturated * is_owned
         saturation[:, 1] = np.maximum(saturation[:, 1], cleaned.longest_ms)
-    return _Found(np.concatenate(samples), np.concatenate(channels), piece.first_stimulus, saturation, piece.lost)
+    return _Found(np.concatenate(samples), np.concatenate(channels), piece.first_stimulus, saturation, lost)
 
 
 def median_noise_uv(
@@ -242,13 +239,11 @@ def find_negative_peaks(
     peak_uv = voltage_uv[row, column]
     low = (peak_uv <= voltage_uv[row, before]) & (peak_uv <= voltage_uv[row, after])
     row, column, peak_uv = row[low], column[low], peak_uv[low]
-    if not len(row):
-        return row.astype(np.int64), column.astype(np.int64)
     padded = np.pad(voltage_uv, ((0, 0), (apart, apart)), constant_values=np.inf)
     around = padded[row[:, None], column[:, None] + np.arange(2 * apart + 1)[None, :]]
     is_least = np.all(peak_uv[:, None] < around[:, :apart], axis=1)
     is_least &= np.all(peak_uv[:, None] <= around[:, apart + 1 :], axis=1)
-    return row[is_least].astype(np.int64), column[is_least].astype(np.int64)
+    return row[is_least], column[is_least]
 
 
 def band_pass(

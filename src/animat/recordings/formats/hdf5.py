@@ -193,8 +193,6 @@ def hdf5_file(path: Path) -> Iterator[Hdf5File]:
             yield Hdf5File(path, file)
     except (InvalidFile, InvalidArgument):
         raise
-    except FileNotFoundError as error:
-        raise InvalidFile(f"{path}: no such file") from error
     except UnusableData as error:
         # The file is not damaged; its contents are invalid.
         raise InvalidFile(f"{path}: {error}") from error

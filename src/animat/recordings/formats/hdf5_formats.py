@@ -28,12 +28,7 @@ def format_of(file: Hdf5File) -> Literal["NWB", "MaxWell", "CL1"]:
 
 
 def read_hdf5(path: Path, *, part: str | None = None, stimuli: str | None = None) -> Recording:
-    """Read a recording in any of the formats; `part` and `stimuli` are those of `read_recording`.
-
-    Raises:
-        InvalidFile: if the file is damaged, of an unknown format, or holds no recording.
-        InvalidArgument: for a choice that the file's format does not offer.
-    """
+    """Read a recording in any of the formats; `part`, `stimuli` and errors are those of `read_recording`."""
     with hdf5_file(path) as file:
         kind = format_of(file)
         if part is not None and kind != "MaxWell":

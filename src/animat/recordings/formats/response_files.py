@@ -195,12 +195,8 @@ def _table(
     return ResponseTable(
         values=np.asarray(values, dtype=np.float64)[np.argsort(times, kind="stable")],
         kind=kind,
-        channels=recording.channels,
-        stimuli=recording.stimuli,
         has_times=has_times,
         window_ms=window_ms,
-        start_min=recording.start_min,
-        presentation=recording.presentation,
+        **{name: getattr(recording, name) for name in ("channels", "stimuli", "start_min", "presentation", "findings")},
         provenance={**provenance, **recording.provenance},
-        findings=recording.findings,
     )
