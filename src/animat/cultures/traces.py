@@ -88,7 +88,7 @@ def record_traces(
     voltage_uv = _band_limited_noise(rng, samples, len(rows), rate_hz, noise_uv)
     recorded = culture.selection.recording[rows]
     pairs = culture.visibility.pairs_of(recorded)
-    amplitude_uv = culture.visibility.amplitude_at(pairs.neuron, pairs.distance_um)
+    amplitude_uv = culture.visibility.amplitude_at(pairs)
     spikes = [np.empty((0, 3))]
     for neuron in np.unique(pairs.neuron):
         seen = pairs.neuron == neuron

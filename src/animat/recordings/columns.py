@@ -139,9 +139,7 @@ class PlainColumns:
             )
         return table, values.astype(np.int64)
 
-    def _stimuli(
-        self, time_s: Float64[np.ndarray, " stimuli"], in_time: Int64[np.ndarray, " stimuli"], noted: list[Finding]
-    ) -> tuple[Stimuli, dict[str, str]]:
+    def _stimuli(self, time_s: Column, in_time: Column, noted: list[Finding]) -> tuple[Stimuli, dict[str, str]]:
         """The stimulus table, and the patterns' names for the provenance."""
         n = len(time_s)
         frequency_hz, pattern, names = np.full(n, np.nan), np.full(n, UNKNOWN), dict[str, str]()
@@ -175,12 +173,10 @@ class PlainColumns:
         _expect_electrodes("stimulus_electrodes", whole, expected)
         return whole
 
-    def _presentations(
-        self, n: int, in_time: Int64[np.ndarray, " stimuli"], noted: list[Finding]
-    ) -> Int64[np.ndarray, " stimuli"]:
+    def _presentations(self, n: int, in_time: Column, noted: list[Finding]) -> Column:
         if self.stimulus_presentation is not None:
             column = _column("stimulus_presentation", self.stimulus_presentation, n)
-            presentations: Int64[np.ndarray, " stimuli"] = _whole("stimulus_presentation", column)[in_time]
+            presentations: Column = _whole("stimulus_presentation", column)[in_time]
             unknown = presentations == UNKNOWN
             # `Stimuli` refuses numbers that fall.
             if not np.any(unknown) or np.any(np.diff(presentations[~unknown]) < 0):
@@ -237,9 +233,7 @@ def recorded_span(frames: int, rate_hz: float, *times_s: Column) -> dict[str, fl
     return {"start_s": start_s, "duration_s": stop_s - start_s}
 
 
-def _in_time(
-    name: str, column: Column, events: str, noted: list[Finding]
-) -> tuple[Float64[np.ndarray, " events"], Int64[np.ndarray, " events"]]:
+def _in_time(name: str, column: Column, events: str, noted: list[Finding]) -> tuple[Column, Column]:
     """The sorted times and the (stable) order that sorts them; reports times that were out of order."""
     times_s = _numbers(name, np.asarray(column))
     if times_s.ndim != 1:

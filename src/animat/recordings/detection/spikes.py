@@ -10,11 +10,12 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int64
+from jaxtyping import Float32, Float64, Int64
 from scipy import fft, signal
 
 from animat.errors import InvalidArgument
 from animat.progress import Progress, Silent
+from animat.recordings.detection.artefacts import Counts, Flags, Levels, Pulses, Traces
 from animat.recordings.detection.pieces import Piece, read_piece
 from animat.recordings.detection.settings import Detection
 from animat.recordings.findings import Finding
@@ -46,7 +47,7 @@ class DetectedSpikes:
 
     time_s: Float64[np.ndarray, " spikes"]
     channel: Int64[np.ndarray, " spikes"]
-    noise_uv: Float32[np.ndarray, " channels"]
+    noise_uv: Levels
     findings: tuple[Finding, ...]
 
 
@@ -113,7 +114,7 @@ def detect_spikes(
     )
 
 
-def is_dead(noise_uv: Float32[np.ndarray, " channels"]) -> np.ndarray:
+def is_dead(noise_uv: Levels) -> np.ndarray:
     """Whether a channel has hardly any noise, so that no signal reaches it; shape (channels,)."""
     return np.asarray(noise_uv <= DEAD * np.median(noise_uv)) if len(noise_uv) else np.zeros(0, dtype=bool)
 
@@ -124,7 +125,7 @@ def blocks(channels: int) -> Iterator[slice]:
 
 
 def _noise_and_level_uv(
-    traces: RawTraces, stimulus: Int64[np.ndarray, " stimuli"], settings: Detection, workers: int
+    traces: RawTraces, stimulus: Pulses, settings: Detection, workers: int
 ) -> Float32[np.ndarray, "2 channels"]:
     """The noise of each channel and its usual voltage: medians over pieces spread over the recording."""
     rate_hz, channels = traces.sampling_rate_hz, len(traces.channels)
@@ -160,16 +161,10 @@ class _Found(NamedTuple):
     channel: Int64[np.ndarray, " spikes"]
     first_stimulus: int
     saturation: Float64[np.ndarray, "stimuli 2"]
-    lost: Int64[np.ndarray, " channels"]
+    lost: Counts
 
 
-def _search(
-    piece: Piece,
-    noise_uv: Float32[np.ndarray, " channels"],
-    level_uv: Float32[np.ndarray, " channels"],
-    rate_hz: float,
-    settings: Detection,
-) -> _Found:
+def _search(piece: Piece, noise_uv: Levels, level_uv: Levels, rate_hz: float, settings: Detection) -> _Found:
     depth_uv = np.where(is_dead(noise_uv), np.inf, settings.threshold * noise_uv).astype(np.float32)
     apart = max(round(settings.dead_time_ms * 1e-3 * rate_hz), 1)
     first, last = piece.margin, piece.margin + piece.stop - piece.start
@@ -192,9 +187,7 @@ def _search(
     return _Found(np.concatenate(samples), np.concatenate(channels), piece.first_stimulus, saturation, lost)
 
 
-def median_noise_uv(
-    voltage_uv: Float32[np.ndarray, "channels samples"], is_blank: Bool[np.ndarray, "channels samples"] | None = None
-) -> Float32[np.ndarray, " channels"]:
+def median_noise_uv(voltage_uv: Traces, is_blank: Flags | None = None) -> Levels:
     """Standard deviation of each channel's noise, in filtered traces: median(|v - median(v)|) / 0.6745.
 
     NaN for a channel of which nearly everything is blanked.
@@ -220,11 +213,7 @@ def _median(values: Float32[np.ndarray, "rows values"]) -> Float32[np.ndarray, "
 
 
 def find_negative_peaks(
-    voltage_uv: Float32[np.ndarray, "channels samples"],
-    depth_uv: Float32[np.ndarray, " channels"],
-    apart: int,
-    first: int,
-    last: int,
+    voltage_uv: Traces, depth_uv: Levels, apart: int, first: int, last: int
 ) -> tuple[Int64[np.ndarray, " peaks"], Int64[np.ndarray, " peaks"]]:
     """Rows and samples of the negative peaks from sample `first` on until `last`.
 
@@ -246,9 +235,7 @@ def find_negative_peaks(
     return row[is_least], column[is_least]
 
 
-def band_pass(
-    voltage_uv: Float32[np.ndarray, "channels samples"], band_hz: tuple[float, float] | None, rate_hz: float
-) -> Float32[np.ndarray, "channels samples"]:
+def band_pass(voltage_uv: Traces, band_hz: tuple[float, float] | None, rate_hz: float) -> Traces:
     """Filter each row, zero-phase, by Fourier transform; `MARGIN_S` at both ends is not usable.
 
     The gain at frequency f is |H(f)|^2, H being a Butterworth band-pass of order 3 whose |H|^2 is a half at the ends of
@@ -271,7 +258,7 @@ def _gain(length: int, band_hz: tuple[float, float], rate_hz: float) -> Float32[
     return np.asarray(np.abs(gain) ** 2, dtype=np.float32)
 
 
-def _lost(lost: Int64[np.ndarray, " channels"], samples: int) -> Iterator[Finding]:
+def _lost(lost: Counts, samples: int) -> Iterator[Finding]:
     if n := int(lost.sum()):
         n_channels = np.count_nonzero(lost)
         share = n / (samples * n_channels)
@@ -280,9 +267,7 @@ def _lost(lost: Int64[np.ndarray, " channels"], samples: int) -> Iterator[Findin
         yield Finding("samples-lost", "note" if share < MUCH_LOST else "warning", message, float(n))
 
 
-def _findings(
-    noise_uv: Float32[np.ndarray, " channels"], n_stimuli: int, saturation: np.ndarray, settings: Detection
-) -> Iterator[Finding]:
+def _findings(noise_uv: Levels, n_stimuli: int, saturation: np.ndarray, settings: Detection) -> Iterator[Finding]:
     n, middle = len(noise_uv), float(np.median(noise_uv)) if len(noise_uv) else 0.0
     yield Finding("noise", "note", f"noise: {middle:.2f} uV on the median of {n:,} channels; spikes are negative "
                   f"peaks of {settings.threshold:g} times their channel's noise and more", middle)  # fmt: skip
