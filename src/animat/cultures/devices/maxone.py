@@ -15,9 +15,8 @@ import numpy as np
 from jaxtyping import Int64
 
 from animat.cultures.base import Culture
-from animat.cultures.devices.maxone_sequences import FRAMES_PER_S, INITIAL_DELAY, SAMPLE_US, Sequences
+from animat.cultures.devices.maxone_commands import FRAMES_PER_S, INITIAL_DELAY, SAMPLE_US, Sequences, Wiring, wire
 from animat.cultures.devices.maxone_stream import AMPLIFIERS, SpikeStream, ZmqSpikes
-from animat.cultures.devices.maxone_wiring import Wiring, wire
 from animat.cultures.failures import as_device_failure, describe_error, once_opened, vendor_module, while_open
 from animat.cultures.holding import of_the_machine
 from animat.cultures.observed import Observed, observed_in_frames

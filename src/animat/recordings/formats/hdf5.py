@@ -216,16 +216,13 @@ def _as_text(values: Column) -> Column:
     return np.array(flat, dtype=np.str_).reshape(values.shape)
 
 
-INSPECT_OR_CONVERT = "animat inspect or animat convert; other commands need the file converted first"
-
-
 def choose(
     what: str,
     option: str,
     names: Iterable[str],
     asked: str | None,
     describe: Callable[[str], str] = lambda name: name,
-    commands: str = INSPECT_OR_CONVERT,
+    commands: str = "animat inspect or animat convert; other commands need the file converted first",
 ) -> str:
     """The name that was asked for, or the only one; other cases are refused, with a list of the names.
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import io
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from functools import lru_cache
-from typing import Any, TypeVar
+from typing import Any
 
 import h5py
 import numpy as np
@@ -35,8 +35,6 @@ from animat.writing import atomic_write
 
 LARGEST_VALUES = 10_000_000
 """Rows times columns of the electrodes table."""
-
-T = TypeVar("T", int, float, str)
 
 
 @checked_arguments
@@ -139,32 +137,31 @@ def read_nwb(file: Hdf5File, stimuli: str | None = None) -> Recording:
         return read_foreign_nwb(file, stimuli)
     if stimuli is not None:
         raise InvalidFile(f"{path}: expected no choice of stimuli for animat's own file, got {stimuli!r}")
-    version = _cell(file, "format_version", int)
+    version = int(_cell(file, "format_version"))
     if version > FORMAT_VERSION:
         raise InvalidFile(f"{path}: expected format version {FORMAT_VERSION} or older, got {version}: update animat")
     texts = dict[str, str]()
     if file.has(PROVENANCE_TABLE):
         keys, values = (file.read(f"{PROVENANCE_TABLE}/{name}").tolist() for name in ("key", "words"))
         texts = dict(zip(keys, values, strict=True))
-    order, pulses = _cell(file, "presentation_order", str), _cell(file, "presentation_pulses", int)
+    order, pulses = str(_cell(file, "presentation_order")), int(_cell(file, "presentation_pulses"))
+    names = ("sampling_rate_hz", "start_s", "duration_s", "start_min")
+    scalars: dict[str, Any] = {name: float(_cell(file, name)) for name in names}
     times, channels = _spikes(file)
     with in_file(path):
         return Recording(
             spike_times_s=times,
             spike_channels=channels,
             channels=_channels(file),
-            stimuli=_stimuli(file, _cell(file, "stimulus_electrode_columns", int)),
-            sampling_rate_hz=_cell(file, "sampling_rate_hz", float),
-            start_s=_cell(file, "start_s", float),
-            duration_s=_cell(file, "duration_s", float),
-            start_min=_cell(file, "start_min", float),
+            stimuli=_stimuli(file, int(_cell(file, "stimulus_electrode_columns"))),
             presentation=Presentation(order, pulses) if order else None,  # type: ignore[arg-type]
+            **scalars,
             **from_metadata(texts),
         )
 
 
-def _cell(file: Hdf5File, name: str, kind: Callable[[Any], T]) -> T:
-    return kind(file.read(f"{RECORDING_TABLE}/{name}")[0].item())
+def _cell(file: Hdf5File, name: str) -> Any:
+    return file.read(f"{RECORDING_TABLE}/{name}")[0].item()
 
 
 def _spikes(file: Hdf5File) -> tuple[Float64[np.ndarray, " spikes"], Int64[np.ndarray, " spikes"]]:

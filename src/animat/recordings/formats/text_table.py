@@ -28,10 +28,7 @@ _THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2}(,\d{3})+", re.ASCII)
 class TextTable:
     """A table with its header and cells as text, unchanged from the file.
 
-    Attributes:
-        lines: the line of the file on which each row ends, counted from 1.
-        used: the columns that were looked up.
-        findings: methods add to them.
+    `lines` are those of the file on which rows end, counted from 1; `used` are the columns that were looked up.
     """
 
     path: Path
