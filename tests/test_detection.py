@@ -112,6 +112,8 @@ def test_the_filter_is_the_two_pass_butterworth() -> None:
     expected = signal.sosfiltfilt(sections, voltage.astype(np.float64), axis=1)
     filtered = band_pass(voltage, (100.0, 3000.0), RATE_HZ)
     np.testing.assert_allclose(filtered[:, 1000:-1000], expected[:, 1000:-1000], atol=2e-3)
+    # Without a band, traces are filtered already.
+    np.testing.assert_array_equal(band_pass(voltage, None, RATE_HZ).T, voltage.T - np.median(voltage, axis=1))
 
 
 @settings(deadline=None, max_examples=60)

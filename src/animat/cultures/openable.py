@@ -33,12 +33,6 @@ class Turns:
         self.guard = guard
         self._lock = threading.RLock()
         self._is_taken = self._is_over = False
-        self._process = os.getpid()
-
-    @property
-    def is_elsewhere(self) -> bool:
-        """Whether this is a copy that a fork made of another process's turns."""
-        return self._process != os.getpid()
 
     def __enter__(self) -> Guard:
         while not self._lock.acquire(timeout=_LOOK_S):
@@ -197,7 +191,7 @@ class Openable(abc.ABC):
             if turns is None:
                 return
             with as_device_failure(self.name, "close"), self.__hold.pop_all():
-                if turns.is_elsewhere:
+                if not is_ours:
                     # A fork's copy is not a culture of this process, which must not close the device.
                     return
                 try:
@@ -262,6 +256,6 @@ class Openable(abc.ABC):
 
     def _opened(self) -> Turns:
         turns = while_open(self.__turns)
-        if turns.is_elsewhere:
+        if self.__process != os.getpid():
             raise InvalidArgument("culture: expected one that this process opened, got a copy made by a fork")
         return turns

@@ -103,8 +103,6 @@ class Coupling:
         drawn as functions of the pulse's step: they do not depend on how time is divided.
         """
         parameters = self._parameters
-        if len(pulse.x_um) == 0:
-            return NO_KICKS
         reach = self.reach(pulse.x_um, pulse.y_um)
         draw, jitter = axonal_draws(reach.axon_key, pulse_step)
         passes = (draw < parameters.axon_reliability) & (reach.axon_rank < pulse.strength)
