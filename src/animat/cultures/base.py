@@ -254,11 +254,9 @@ def _plain_request(stimuli: Iterable[Stimulus], duration_s: float) -> tuple[Sequ
     """The arguments of a delivery as immutable plain values; refuses anything else, and a stimulus after the end."""
     stimuli, duration_s = plain_stimuli(stimuli), _plain_duration(duration_s)
     times_s = [stimulus.time_s for stimulus in stimuli]
-    for time_s in times_s:
-        if not time_s < duration_s:
-            raise InvalidArgument(
-                f"stimuli: expected times before the delivery ends ({duration_s:g} s), got {time_s:g} s"
-            )
+    if late_s := [time_s for time_s in times_s if not time_s < duration_s]:
+        expected = f"times before the delivery ends ({duration_s:g} s)"
+        raise InvalidArgument(f"stimuli: expected {expected}, got {late_s[0]:g} s")
     # The guard checks the times of pulses, and does not see rests.
     has_rests = any(stimulus.is_rest for stimulus in stimuli)
     if has_rests and not all(before <= after for before, after in pairwise([0.0, *times_s])):

@@ -160,14 +160,12 @@ class Hdf5File:
         value = value.item() if isinstance(value, np.generic) else value
         return value.decode("utf-8", "replace") if isinstance(value, bytes) else value
 
-    def row_lengths(self, where: str, n_values: int) -> np.ndarray[Any, np.dtype[np.int64]]:
+    def row_lengths(self, where: str, n: int) -> np.ndarray[Any, np.dtype[np.int64]]:
         """How many values each row of a ragged column of NWB has; refuses an index that does not divide them."""
         ends = self.read(f"{where}_index").astype(np.int64).reshape(-1)
         lengths = np.diff(ends, prepend=0)
-        if np.any(lengths < 0) or lengths.sum() != n_values:
-            raise InvalidFile(
-                f"{self.path}: /{where}_index does not divide the {n_values:,} values of /{where}: damaged"
-            )
+        if np.any(lengths < 0) or lengths.sum() != n:
+            raise InvalidFile(f"{self.path}: /{where}_index does not divide the {n:,} values of /{where}: damaged")
         return lengths
 
 
