@@ -21,8 +21,7 @@ from animat.recordings.formats.npz import read_npz
 from animat.recordings.formats.response_files import read_response_npz, read_response_table
 from animat.recordings.formats.text_table import GZIP, read_text_table
 from animat.recordings.hdf5_subprocess import read_hdf5_in_subprocess
-from animat.recordings.recording import Recording
-from animat.recordings.response_table import ResponseTable
+from animat.recordings.recording import Recording, ResponseTable
 
 S = TypeVar("S", Recording, Recording | ResponseTable)
 

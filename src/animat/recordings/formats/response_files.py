@@ -15,12 +15,12 @@ from animat.recordings.findings import Finding, left_out_findings
 from animat.recordings.formats.csv import SPIKE_COLUMNS, STIMULUS_COLUMNS, nearest, plain_column
 from animat.recordings.formats.npz import KEYS, load_columns
 from animat.recordings.formats.text_table import TextTable, folded
-from animat.recordings.response_table import Kind, ResponseTable
+from animat.recordings.recording import ResponseKind, ResponseTable
 
-KINDS: tuple[Kind, ...] = ("count", "rate_hz")
+KINDS: tuple[ResponseKind, ...] = ("count", "rate_hz")
 TABLE_COLUMNS = STIMULUS_COLUMNS | {"stimulus_pattern": (*STIMULUS_COLUMNS["stimulus_pattern"], "condition")}
 NPZ_KEYS = {f"response_{kind}": kind for kind in KINDS}
-_Read = tuple[Float64[np.ndarray, "stimuli channels"], Kind, Column, Int64[np.ndarray, " lines"]]
+_Read = tuple[Float64[np.ndarray, "stimuli channels"], ResponseKind, Column, Int64[np.ndarray, " lines"]]
 """Values, their kind, the channels, and for each line the first line of its stimulus."""
 TRIAL = "trial"
 
@@ -109,7 +109,7 @@ def _wide(table: TextTable) -> _Read:
     return values, kind, labels, np.arange(len(table.rows))
 
 
-def _label(head: str, kind: Kind) -> str:
+def _label(head: str, kind: ResponseKind) -> str:
     """The part of a header after the kind, such as 12 in `Rate (Hz) 12`."""
     return next(head[i:].strip() for i in range(len(head) + 1) if folded(f"{head[:i]}x") == f"{kind}_x")
 
@@ -173,7 +173,7 @@ def _constant(table: TextTable, name: str) -> float | None:
 
 def _table(
     values: Column,
-    kind: Kind,
+    kind: ResponseKind,
     labels: Column,
     columns: dict[str, Any],
     window_ms: tuple[float, float] | None,
