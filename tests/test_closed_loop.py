@@ -707,6 +707,26 @@ def test_what_the_device_left_out_is_reported(tmp_path: Path) -> None:
     assert read_recording(session.recording_file).provenance["left_out"] == "7 frames lost"
 
 
+@pytest.mark.parametrize("error", [RuntimeError("gone"), ConnectionResetError("gone")])
+def test_a_device_that_can_no_longer_count_does_not_keep_the_session_from_ending(
+    tmp_path: Path, error: Exception
+) -> None:
+    class Gone(FakeCulture):
+        @property
+        def left_out(self) -> dict[str, int]:
+            if self.deliveries > 4:
+                raise error
+            return {}
+
+    def lost(culture: FakeCulture, observed: Observed) -> Observed:
+        raise error
+
+    with Gone(fault=lost, at=4) as culture:
+        session = run_session(culture, loop_of(), [RANDOM], tmp_path)
+    assert session.ending.message.endswith(f"got {type(error).__name__}: gone")
+    assert (session.ending, session.outline.left_out) == (read_session(tmp_path).ending, {})
+
+
 def test_unanswered_pulses_are_counted_in_whatever_order_threads_write() -> None:
     of: dict[str, Any] = {"stretch": 0, "stimuli": [[5.0, 0, 0, [100, 101]]], "tick": None}
     asked, seen, failed = ({"kind": kind, **of} for kind in ("asked", "seen", "event"))

@@ -69,7 +69,8 @@ import sys
 from animat.compilation import keep_compilations
 keep_compilations()
 import jax
-print(jax.jit(lambda x: x + 1)(1), jax.config.jax_compilation_cache_dir)
+one = jax.jit(lambda x: x + 1)(0)
+print(one, one.dtype, jax.config.jax_compilation_cache_dir)
 from synthetic_recordings import synthetic_recording
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.reading import read_recording
@@ -90,9 +91,9 @@ def test_a_home_that_is_a_file_keeps_nothing_and_says_nothing(tmp_path: Path) ->
     done = subprocess.run(
         [sys.executable, "-c", COMPILING, str(tmp_path / "für mich.nwb")],
         cwd=Path(__file__).parent,
-        env=without | {"HOME": str(home), "LC_ALL": language},
+        env=without | {"HOME": str(home), "LC_ALL": language, "JAX_ENABLE_X64": "1"},
         capture_output=True,
         text=True,
         check=False,
     )
-    assert (done.returncode, done.stdout, done.stderr) == (0, "2 None\nTrue\n", "")
+    assert (done.returncode, done.stdout, done.stderr) == (0, "1 int32 None\nTrue\n", "")

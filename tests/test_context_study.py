@@ -24,7 +24,7 @@ from animat.studies.context import (
     protocol_for,
     run_context_study,
 )
-from animat.studies.context_page import summarise_robot, write_context_page
+from animat.studies.context_page import summarise_cultures, summarise_robot, write_context_page
 
 
 def row(culture: int, robot: str, **known: Any) -> ContextRow:
@@ -49,11 +49,16 @@ def test_what_holds_is_counted_over_cultures() -> None:
     needs, cartpole = summarise_robot(rows()[:2]), summarise_robot(rows()[2:])
     assert needs == (
         "A reflex leaves half of the task or more undone on 1 of 2 cultures (context gap 0.40 to 0.70). The policies "
-        "do significantly more than the best reflex on 1 of 2 (context score 0.10 to 0.90)."
+        "do significantly more than the best reflex on 1 of 2 cultures with a context score (0.10 to 0.90)."
     )
     assert cartpole == (
-        "A reflex leaves half of the task or more undone on 0 of 2 cultures (context gap 0.00 to 0.01). The policies "
-        "do significantly more than the best reflex on 0 of 2."
+        "A reflex leaves half of the task or more undone on 0 of 2 cultures (context gap 0.00 to 0.01). No culture has "
+        "a context score."
+    )
+    # A third of a task is more than a reflex does, but not half of the task.
+    third = tuple(row(c, "arm", gap=0.33, gap_low_95=0.3, gap_high_95=0.36) for c in (1, 2))
+    assert summarise_cultures({"shuttle": rows()[:1], "arm": third}).startswith(
+        "A reflex leaves half of the task or more undone on every culture for shuttle. The policies do "
     )
     some = summarise_robot((*rows()[:2], replace(rows()[0], gap=None, score=None, score_low_95=None)))
     assert some == needs.replace("0.70).", "0.70); on 1 more this is not known.")
@@ -77,7 +82,7 @@ def test_without_an_optimal_return_values_are_marked_as_lower_bounds(tmp_path: P
     of_robot = (row(1, "detour", **interval, **known), row(2, "detour", **interval, **known | {"gap": 0.75}))
     assert summarise_robot(of_robot) == (
         "A reflex leaves half of the task or more undone on 2 of 2 cultures (context gap at least 0.75 to 0.80). The "
-        "policies do significantly more than the best reflex on 2 of 2 (context score at least 0.60)."
+        "policies do significantly more than the best reflex on 2 of 2 cultures with a context score (at least 0.60)."
     )
     study = ContextStudy(cultures=(1, 2), robots=("detour",))
     text = write_context_page(study, ContextRun(tmp_path, of_robot, (), {})).read_text()

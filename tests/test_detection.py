@@ -548,7 +548,7 @@ def test_after_frames_that_a_maxone_lost_spikes_are_where_they_were(tmp_path: Pa
     for place, number in ((-1, 2**40), (5, 0)):
         with h5py.File(path, "r+") as file:
             file["wells/well000/rec0000/groups/routed/frame_nos"][place] = number
-        with pytest.raises(InvalidFile, match="expected rising frame_nos for 19,400 samples"):
+        with pytest.raises(InvalidFile, match="expected rising frame_nos or timestamps for 19,400 samples"):
             open_traces(path)
 
 
@@ -643,6 +643,31 @@ def test_raw_traces_of_an_nwb_file(tmp_path: Path) -> None:
         del file["acquisition/others"], file["acquisition/traces/data"]
     with pytest.raises(InvalidFile, match="expected raw traces at /acquisition/traces/data, found none"):
         read_traces(tmp_path / "a.nwb", Detection())
+
+
+def test_after_a_gap_in_the_timestamps_of_an_nwb_file_spikes_are_where_they_were(tmp_path: Path) -> None:
+    voltage, _ = noisy(3, 1.0, step_uv=1.0)
+    write_nwb_traces(tmp_path / "a.nwb", voltage, start_s=7.0)
+    whole = read_traces(tmp_path / "a.nwb")
+    kept = np.delete(np.arange(len(voltage)), np.s_[8000:8600])
+    # Timestamps in microseconds, of a rate at which they are rounded.
+    rate_hz = 0.7 * RATE_HZ
+    with h5py.File(tmp_path / "a.nwb", "r+") as file:
+        series = file["acquisition/traces"]
+        del series["data"], series["starting_time"]
+        series["data"], series["timestamps"] = voltage[kept], np.round(7.0 + kept / rate_hz, 6)
+        series["data"].attrs["conversion"] = 1e-6
+    gapped, far = read_traces(tmp_path / "a.nwb"), np.abs(whole.spike_times_s - 7.415) > 0.018
+    assert gapped.sampling_rate_hz == pytest.approx(rate_hz, rel=1e-6)
+    assert np.count_nonzero(whole.spike_times_s > 7.43) > 3
+    # To a sample: at another rate the filter is another.
+    np.testing.assert_allclose(gapped.spike_times_s, 7 + (whole.spike_times_s[far] - 7) / 0.7, atol=1.1 / rate_hz)
+    for times in ([0.0], np.zeros(len(kept)), np.full(len(kept), np.nan)):
+        with h5py.File(tmp_path / "a.nwb", "r+") as file:
+            del file["acquisition/traces/timestamps"]
+            file["acquisition/traces/timestamps"] = times
+        with pytest.raises(InvalidFile, match=f"expected two or more rising times in s .* got {len(times):,} others"):
+            open_traces(tmp_path / "a.nwb")
 
 
 def test_traces_of_an_nwb_file_are_on_the_electrodes_that_they_name(tmp_path: Path) -> None:

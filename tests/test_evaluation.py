@@ -26,6 +26,7 @@ from animat.robots import Cartpole, Navigation
 from animat.robots.base import Robot
 from animat.stimulation.protocol import Presentation
 from animat.training.policy import Policy
+from animat.wrappers import EpisodeLimit
 from test_optimal_returns import answers
 from test_simulator import responses_of
 from test_training import timeline_of
@@ -130,6 +131,18 @@ def test_actors_have_random_numbers_of_their_own_and_a_seed_decides_them() -> No
     assert np.array_equal(run(3), run(3))
     assert not np.array_equal(run(3), run(4))
     assert not np.array_equal(run(3)[0], run(3)[1])
+
+
+@pytest.mark.oracle
+def test_where_the_user_computes_in_64_bits_episodes_are_the_same() -> None:
+    environment = EpisodeLimit(Animat(Cartpole(episode_limit=20), Thresholds(9), 5))
+
+    def run() -> np.ndarray:
+        return roll_out(environment, synthetic_simulator(), Uniform(), episodes=5, seed=1).returns
+
+    usual = run()
+    with jax.enable_x64(True):
+        np.testing.assert_array_equal(run(), usual)
 
 
 def test_jax_does_not_take_actors_without_numbers_for_each_other() -> None:

@@ -150,6 +150,8 @@ def test_what_happened_is_in_the_log_in_order(ran: tuple[LiveRun, Path, int]) ->
     ]  # fmt: skip
     for name in ("at", "wall_s", "culture_min"):
         assert all(one[name] <= next_[name] for one, next_ in pairwise(events))
+    # On the culture's own clock, as the minutes of the recordings.
+    assert events[0]["culture_min"] == 0.2
     assert not (folder / ".exchange").exists()
     json.dumps(found.to_dict())
 

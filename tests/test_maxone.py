@@ -17,6 +17,7 @@ from animat.cultures.contract import CultureContract
 from animat.cultures.devices.maxone import MAXONE_LIMITS, MaxOneCulture
 from animat.cultures.devices.maxone_commands import dac_code
 from animat.cultures.devices.maxone_stream import EVENT_16, EVENT_24, ZmqSpikes
+from animat.cultures.same_culture import other_channels
 from animat.errors import DeviceFailed, InvalidArgument, UnsafeStimulus
 from animat.recordings.formats.stimulus_text import parse_line
 from animat.stimulation.array import MAXONE
@@ -25,6 +26,7 @@ from animat.stimulation.protocol import Protocol
 from animat.stimulation.pulse import BALANCED_PULSE, PUBLISHED_PULSE, Phase, Pulse
 from animat.stimulation.selection import Selection
 from animat.stimulation.stimulus import Stimulus
+from animat.tables import UNKNOWN
 from stand_in_maxlab import LSB_MV, Rig, Stream, install
 
 SITES = [(20 + 25 * (i // 8)) * 220 + 15 + 25 * (i % 8) for i in range(32)]
@@ -70,8 +72,16 @@ def test_stimulation_electrodes_that_were_not_routed_are_refused_by_name(rig: Ri
 
 
 def test_recording_electrodes_that_were_not_routed_are_left_out_and_counted(rig: Rig) -> None:
+    rig.drop = {13_052}
+    with culture_on(rig) as culture:
+        recording = culture.record(Protocol((40.0,), trials=2, setup_s=0.0, pause_s=0.0, pulse=BALANCED_PULSE))
+        assert other_channels(recording, culture) is None
     rig.drop = {13_050, 13_051}
     with culture_on(rig) as culture:
+        found = other_channels(recording, culture)
+        assert found is not None and (found.name, found.value) == ("other-channels", 3)
+        unknown = replace(recording.channels, electrode=np.full(len(recording.channels), UNKNOWN))
+        assert other_channels(replace(recording, channels=unknown), culture) is None
         assert culture.not_routed == (13_050, 13_051)
         assert len(culture.channels) == len(RECORDED) - 2
         assert culture.provenance["not_routed"] == "13050 13051"
@@ -214,7 +224,10 @@ def test_spikes_are_by_channel_and_those_of_no_electrode_are_counted(rig: Rig) -
         assert culture.channels.electrode[spikes.channel].tolist() == [RECORDED[31], RECORDED[32]]
         assert culture.channels.label[spikes.channel].tolist() == ["31", "32"]
         assert culture.spikes_not_recorded == 1
-        assert culture.left_out == {"spikes on amplifiers without an electrode": 1, "frames lost on the way": 0}
+        without = {"spikes on amplifiers without an electrode": 1, "frames lost on the way": 0}
+        assert culture.left_out == without | {"spikes reported late": 0}
+        stream.late_spikes = 2  # type: ignore[attr-defined]
+        assert culture.left_out == without | {"spikes reported late": 2}
 
 
 def test_a_stop_takes_the_power_and_says_what_was_sent(rig: Rig) -> None:
@@ -391,7 +404,13 @@ def test_spikes_that_come_out_of_order_are_taken_by_their_frame() -> None:
         spikes["frame"], spikes["channel"] = frames, [1, 2]
         stream.hear([np.uint64(message).tobytes(), b"", spikes.tobytes()])
     assert stream.take(980, 1005)[0].tolist() == [990, 1004]
-    assert stream.take(1005, 1030)[0].tolist() == [1010, 1015]
+    # One comes after the frames around it were taken.
+    spikes["frame"] = [1001, 1022]
+    stream.hear([np.uint64(1024).tobytes(), b"", spikes.tobytes()])
+    assert stream.take(1005, 1030)[0].tolist() == [1010, 1015, 1022]
+    assert stream.late_spikes == 1
+    stream.take(1040, 1040)
+    assert stream.late_spikes == 1
 
 
 @pytest.mark.parametrize("layout", [EVENT_24, EVENT_16])

@@ -73,6 +73,10 @@ def test_a_session_takes_its_pauses_and_what_is_presented() -> None:
     total_s = 4 * (3 + 12 / 5 + 82 / 80) + 2 * (3 + 10 / 5 + 80 / 80)
     assert found.planned_min == pytest.approx(total_s / 60)
     assert found.drifted_min == pytest.approx((-100 * math.log(0.75) - 5, -50 * math.log(0.75) - 5))
+    # On a clock that was restarted no time is known to have passed.
+    for now_min in (0.0, 10.0):
+        restarted = outlook(loop, calibration, plan, account, now_min)
+        assert restarted.drifted_min == pytest.approx((-100 * math.log(0.75), -50 * math.log(0.75)))
     assert found.budget_min == pytest.approx(total_s / 60 / 4)
     assert str(found).endswith("; the plan is longer: ask for fewer --episodes")
     assert "the plan is longer" not in str(replace(found, budget_min=math.inf))

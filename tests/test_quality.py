@@ -228,6 +228,17 @@ def test_an_artefact_is_compared_with_as_much_time_as_it_takes() -> None:
     assert finding.message.startswith("from -1 to 1 ms there are 130.0 spikes per stimulus, 32.5 times as many")
 
 
+def test_an_artefact_s_share_of_all_spikes_counts_every_pulse() -> None:
+    """Trains of ten pulses, which are too close to each other to find the artefact by them, have it too."""
+    stimulus_s = np.concatenate([np.arange(1.0, 31.0), *(31 + t + 0.0125 * np.arange(10) for t in range(10))])
+    background = [(t, int(1000 * t) % 40) for t in np.random.default_rng(1).uniform(0, 42, 8400)]
+    artefact = [(t + 0.25e-3, channel) for t in stimulus_s for channel in range(40)]
+    finding = findings(recording(background + artefact, stimulus_s, 40, 42.0))["artefact-spikes"]
+    assert finding.message.startswith("from 0 to 0.5 ms there are 40.1 spikes per stimulus")
+    # 130 pulses with 40 spikes each, and 13 of the 8,400 besides.
+    assert "(38.3 % of all)" in finding.message
+
+
 @pytest.mark.parametrize(
     ("offset_s", "kind", "is_coarse"),
     [(0.0, np.float64, False), (0.0, np.float32, False), (1e5, np.float32, True), (1.7e9, np.float64, False)],

@@ -87,6 +87,7 @@ def test_one_comparison_is_reported_without_a_count() -> None:
     assert _found_better([not_better]) == "The second arm was not found to be better."
     assert _found_better([better]) == "The second arm was found to be better."
     assert _found_better([better, not_better]) == "In 1 of 2 comparisons the second arm was found to be better."
+    assert "it is not known whether the second arm is better" in _found_better([replace(ROW, outcome=TOO_FEW)] * 2)
 
 
 def test_differing_comparisons_are_named_with_their_outcomes() -> None:
@@ -155,6 +156,11 @@ def test_an_outcome_that_does_not_hold_after_correction_says_so() -> None:
     assert outcomes == [SECOND, f"{SECOND}, not after correction", f"{FIRST}, not after correction", NONE]
 
 
+def test_a_p_that_is_too_long_to_compute_is_not_called_exact() -> None:
+    shown = comparisons_table([replace(ROW, n=n, p_exact=0.5) for n in (100, 101)])
+    assert [row[shown.head.index("p exact")] for row in shown.rows] == [0.5, None]
+
+
 def test_not_finding_a_difference_is_not_called_no_difference() -> None:
     assert "no difference" not in NONE and "0.01" in NONE
 
@@ -164,7 +170,10 @@ def test_not_finding_a_difference_is_not_called_no_difference() -> None:
 
 def test_a_comparison_is_explained_by_its_optima() -> None:
     assert "other way round" in explain(ROW)
-    assert "use more policies" in explain(replace(ROW, n=4))
+    # Ties can make p smaller: of four equal returns against four larger ones it is 0.013.
+    assert "below 0.03, unless some have equal returns: use more policies" in explain(replace(ROW, n=4))
+    assert compare(np.zeros(4), np.ones(4)).p_normal < 0.014
+    assert explain(replace(ROW, n=1)).startswith("With 1 policy per side")
     assert "nothing to learn" in explain(replace(ROW, optimum_second=-79.8))
     assert "no optimum" in explain(replace(ROW, optimum_second=None))
     assert "leaves room" in explain(replace(ROW, optimum_second=100.0))
@@ -486,6 +495,20 @@ def test_learning_curves_are_of_whole_rounds_of_episodes() -> None:
     np.testing.assert_array_equal(uneven, [[np.nan, 2.0]])
     # Shorter than a round: all there is.
     np.testing.assert_array_equal(over_rounds(iterations[:2], *(np.ones((1, 2)),) * 2, 99), [[np.nan, 1.0]])
+
+
+def test_intervals_of_learning_curves_cover_what_they_say_and_one_policy_has_none() -> None:
+    returns = np.random.default_rng(1).normal(size=(4, 4000))
+    returns[:2, :1000] = np.nan
+    mean, low, high = LearningCurve("a", np.arange(1.0, 4001.0), returns).mean_with_interval()
+    np.testing.assert_allclose(mean, np.nanmean(returns, axis=0))
+    for some in (slice(1000), slice(1000, None)):
+        assert np.mean((low[some] <= 0) & (high[some] >= 0)) == pytest.approx(0.95, abs=0.02)
+    alone = LearningCurve("a", np.array([1.0, 2.0]), np.array([[5.0, np.nan]]))
+    np.testing.assert_equal(alone.mean_with_interval(), [[5.0, np.nan], [np.nan] * 2, [np.nan] * 2])
+    assert legend(draw_learning_curves([alone], "cartpole")) == {"mean of the policies"}
+    ends = LearningCurve("a", np.array([1.0]), np.array([[120.0], [-91.0]]), within=(-219.0, 120.0))
+    assert ends.mean_with_interval()[:, 0].tolist() == [14.5, -219.0, 120.0]
 
 
 def test_an_interval_that_leaves_the_scale_ends_in_an_arrow() -> None:

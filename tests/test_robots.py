@@ -80,6 +80,11 @@ def test_a_state_keeps_its_form_so_that_it_can_be_scanned(robot: Robot) -> None:
     assert [(leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(after)] == [((), jnp.float32)] * len(state)
     assert (reward.shape, reward.dtype) == ((), jnp.float32)
     assert (terminated.shape, terminated.dtype) == ((), jnp.bool_)
+    # Also in a program of the user's that computes in 64 bits.
+    with jax.enable_x64(True):
+        assert jax.eval_shape(robot.reset, jax.random.key(0)) == jax.eval_shape(lambda: state)
+        in_64_bits = jax.eval_shape(robot.step, jax.random.key(1), state, commands_of(robot, 0.3))
+    assert in_64_bits == jax.eval_shape(lambda: (after, reward, terminated))
 
 
 def test_observations_are_the_quantities_in_order(robot: Robot) -> None:

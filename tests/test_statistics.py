@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from animat.errors import InvalidArgument
-from animat.evaluation.statistics import compare, holm, interquartile_mean, normalised_score, p_of_u
+from animat.evaluation.statistics import compare, compare_episodes, holm, interquartile_mean, normalised_score, p_of_u
 
 FINITE = st.floats(-1e3, 1e3, allow_nan=False)
 
@@ -105,6 +105,10 @@ def test_groups_of_thousands_are_compared_by_the_normal_approximation() -> None:
     rng = np.random.default_rng(2)
     compared = compare(rng.integers(0, 50, 1000), rng.integers(5, 55, 1000))
     assert compared.ties and 0 < compared.p_exact == compared.p_normal < 1e-3
+
+
+def test_p_is_never_0() -> None:
+    assert 0 < compare_episodes(np.zeros((4, 400)), np.ones(400)).p < 1e-300
 
 
 def test_equal_samples_show_no_difference() -> None:

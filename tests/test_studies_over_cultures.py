@@ -18,7 +18,7 @@ import pandas as pd
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.stats import bootstrap, mannwhitneyu
+from scipy.stats import mannwhitneyu, ttest_1samp
 
 from animat.cli import main
 from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch, UnusableData
@@ -27,7 +27,7 @@ from animat.report.results import ComparedReturns, Results, Score
 from animat.studies import cultures
 from animat.studies.cultures import (
     CulturesRun,
-    bootstrap_interval,
+    interval_of_mean,
     over_cultures,
     run_over_cultures,
     studies_of,
@@ -121,8 +121,8 @@ def test_each_culture_has_the_study_that_it_would_have_alone(tmp_path: Path) -> 
 
 def test_intervals_over_cultures_are_those_of_scipy() -> None:
     values = np.random.default_rng(3).normal(5, 2, 12)
-    known = bootstrap((values,), np.mean, n_resamples=100_000, method="percentile", random_state=1).confidence_interval
-    assert bootstrap_interval(values) == pytest.approx((known.low, known.high), abs=0.05)
+    known = ttest_1samp(values, 0).confidence_interval(0.95)
+    assert interval_of_mean(values) == pytest.approx((known.low, known.high))
 
 
 def test_over_cultures_each_counts_the_same() -> None:
@@ -130,7 +130,7 @@ def test_over_cultures_each_counts_the_same() -> None:
     (row,) = found
     assert (row.cultures, row.mean_first, row.mean_second, row.difference, row.holds_in) == (3, 2, 6, 4, 2)
     assert (row.larger_in, row.tested, row.found_better) == (3, 3, "2 of 3")
-    assert row.low_95 is not None and 1 <= row.low_95 < 4 < (row.high_95 or 0) <= 10
+    assert row.low_95 is not None and row.low_95 < 1 < 10 < (row.high_95 or 0)
     (alone,) = over_cultures([[compared(0, 10, SECOND)]])
     assert (alone.low_95, alone.high_95) == (None, None)
 

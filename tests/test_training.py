@@ -337,6 +337,15 @@ def test_baselines_without_neurons_learn_their_task(
 
 
 @pytest.mark.oracle
+def test_where_the_user_computes_in_64_bits_policies_are_the_same() -> None:
+    usual = train(SHORT, timeline_of(), None)
+    with jax.enable_x64(True):
+        policies = train(SHORT, timeline_of(), None)
+    for name, policy in policies.items():
+        assert all(map(np.array_equal, policy.weights, usual[name].weights))
+
+
+@pytest.mark.oracle
 def test_a_learning_curve_counts_what_was_done(tmp_path: Path) -> None:
     curve = trained(SHORT, timeline_of(), tmp_path)["p1"].learning_curve
     assert curve.shape == (CHUNKS, 6)

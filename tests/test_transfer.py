@@ -70,7 +70,7 @@ def test_policies_of_blocks_are_reported_by_training_and_evaluation(
     assert "other-presentation" in evaluated["not_met_in_a_closed_loop"]
     assert main(["evaluate", str(tmp_path / "b"), "--recordings", blocked]) == 0
     assert (
-        "a closed loop on the culture would not reach these returns: see the warnings (other-presentation)"
+        "these returns cannot be expected of a closed loop on the culture: see the warnings (other-presentation)"
         in capsys.readouterr().out
     )
 

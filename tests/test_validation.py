@@ -475,6 +475,18 @@ def test_the_organoid_by_hand(real_data: Path, window_ms: tuple[float, float], d
         assert abs(gain.value) < 0.01
 
 
+def test_readouts_are_correlated_over_the_conditions_in_which_both_vary() -> None:
+    condition, read_hz = np.tile([0, 1], 100), np.random.default_rng(5).normal(50, 9, (200, 2))
+    # One condition never reaches the left half.
+    read_hz[condition == 0, 0] = 0.0
+    readouts = Readouts(("left", "right"), ((1,), (2,)))
+    responses = series(read_hz.mean(axis=1), condition, 2, readouts=readouts, readout_hz=read_hz)
+    for found, rows in zip(correlations(responses), (slice(1, 100, 2), slice(101, 200, 2)), strict=True):
+        assert found[0] == pytest.approx(stats.spearmanr(*read_hz[rows].T).statistic)
+    still = replace(responses, readout_hz=np.ones_like(read_hz))
+    assert np.isnan(correlations(still)).all()
+
+
 @pytest.mark.oracle
 def test_several_readouts_by_hand() -> None:
     """Each on its own, of simulators that answer for both; what they remember is of all channels."""

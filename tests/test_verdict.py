@@ -45,6 +45,8 @@ def test_it_says_which_controls_are_not_outperformed() -> None:
     assert every.startswith("the policies outperform every control (p < 0.01; ")
     # Of 10,000 pairs 780 are lost to the nearer one, and 40 are tied.
     assert every.endswith("larger in at least 92 % of the pairs of episodes, ties counting half)")
+    # All but 3 of 10,000 are not "at least 100 %".
+    assert "at least 99 % of the pairs" in str(Verdict.of(ruled, {"nearly all": ruled - 97}))
 
 
 def test_too_few_episodes_are_not_taken_for_no_difference() -> None:

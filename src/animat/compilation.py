@@ -47,11 +47,12 @@ def cache_folder() -> Path:
 def keep_compilations() -> None:
     """Let JAX keep what it compiles in `cache_folder()`, if that is writable; for a process that will compile.
 
-    It also hides everything imported so far from the garbage collector: scanning all of JAX again and again took a
-    quarter of the tracing time.
+    It also turns off 64 bits, whatever `JAX_ENABLE_X64` says, on which results must not depend, and hides everything
+    imported so far from the garbage collector: scanning all of JAX again and again took a quarter of the tracing time.
     """
     import jax
 
+    jax.config.update("jax_enable_x64", False)
     gc.freeze()
     folder = cache_folder()
     try:

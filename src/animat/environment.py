@@ -132,7 +132,7 @@ class Environment(abc.ABC, Generic[RobotState]):
     @final
     def step(self, key: PRNGKeyArray, state: State, action: Array, simulator: Neurons) -> State:
         """One iteration: action, response, command, movement."""
-        return self.advance(jax.random.uniform(key, (self.noise_size,)), state, action, simulator)
+        return self.advance(jax.random.uniform(key, (self.noise_size,), jnp.float32), state, action, simulator)
 
     @property
     def n_drawn(self) -> int:

@@ -75,7 +75,10 @@ class Process:
             return True
         if not self._is_on_core:
             return False
-        resident_pages = int(Path(f"/proc/{self._popen.pid}/statm").read_text().split()[1])
+        try:
+            resident_pages = int(Path(f"/proc/{self._popen.pid}/statm").read_text().split()[1])
+        except FileNotFoundError:  # not on Linux
+            return False
         return resident_pages * os.sysconf("SC_PAGE_SIZE") / 2**20 > _LARGEST_MIB
 
     def end(self) -> None:
@@ -127,16 +130,27 @@ def pin_worker(core: int | None) -> None:
         os.environ.setdefault("JAX_DEFAULT_MATMUL_PRECISION", "highest")
     else:
         # Libraries start as many threads as there are usable cores, and one pinned core beats two shared ones.
-        os.sched_setaffinity(0, {core})
+        if hasattr(os, "sched_setaffinity"):
+            os.sched_setaffinity(0, {core})
         # A few networks of 64 units do not fill a GPU, and all workers would take the same one.
         os.environ["JAX_PLATFORMS"] = "cpu"
     end_with_parent()
 
 
+def own_cores(most: int | None = None) -> list[int]:
+    """The cores that this process may use, at most `most` of them."""
+    cores = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else range(os.cpu_count() or 1)
+    return sorted(cores)[:most]
+
+
 def end_with_parent() -> None:
-    """Let the kernel kill this process when the thread, and so the process, that started it ends."""
+    """Let the kernel kill this process when the thread, and so the process, that started it ends.
+
+    Only Linux can. Elsewhere a worker ends with the work that it has, as its standard input is then closed.
+    """
     PR_SET_PDEATHSIG = 1
-    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    with suppress(AttributeError):
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
 if __name__ == "__main__":

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +11,7 @@ from tyro.conf import Positional
 
 from animat.cli.command import Command
 from animat.errors import AnimatError, expect_at_least
+from animat.process import own_cores
 from animat.writing import expect_writable
 
 
@@ -29,7 +29,7 @@ class ClusterCommand(Command):
     def run(self) -> dict[str, Any]:
         from animat.execution.local_cluster import local_cluster
 
-        workers = len(os.sched_getaffinity(0)) if self.workers is None else self.workers
+        workers = len(own_cores()) if self.workers is None else self.workers
         expect_at_least("--workers", workers, 1)
         expect_writable(self.file.parent, "--file")
         with local_cluster(workers, self.file) as processes:

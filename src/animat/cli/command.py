@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import abc
-import os
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
@@ -12,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from animat.errors import InvalidArgument, InvalidFile, LoopEnded, did_you_mean, expect_at_least, within
+from animat.process import own_cores
 
 if TYPE_CHECKING:
     from animat.closed_loop.session import Session
@@ -63,7 +63,7 @@ class JobOptions(FolderCommand):
         for spec in robots:
             for caveat in spec.robot().caveats():
                 print(f"warning: {caveat}", file=sys.stderr)
-        cores = len(os.sched_getaffinity(0))
+        cores = len(own_cores())
         if self.workers is not None and self.workers > cores:
             print(f"warning: --workers: got {self.workers}; at most one per core is used, {cores}", file=sys.stderr)
 

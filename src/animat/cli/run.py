@@ -85,7 +85,7 @@ class Run(StimulationOptions):
         from animat.closed_loop.session import expect_no_session
         from animat.compilation import keep_compilations
         from animat.cultures.budget import Account, Budget
-        from animat.cultures.same_culture import other_culture, other_patterns
+        from animat.cultures.same_culture import other_channels, other_culture, other_patterns
         from animat.neurons.simulator import check_binning
         from animat.reality_gap import run_policies
         from animat.recordings.reading import read_recordings
@@ -110,7 +110,7 @@ class Run(StimulationOptions):
         with ExitStack() as stack, exclusive_lock(self.out), Bar("culture") as progress:
             expect_no_session(self.out)
             with self._culture(recordings, calibrating, loop.pulse, progress) as culture:
-                noticed = [*unknown, other_culture(calibrating, culture)]
+                noticed = [*unknown, other_culture(calibrating, culture), other_channels(calibrating, culture)]
                 if loop.encoder.takes_patterns:
                     noticed.append(other_patterns(calibrating, culture))
                 gap = run_policies(

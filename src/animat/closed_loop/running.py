@@ -241,13 +241,16 @@ class _Supervisor:
         if self._not_halted is not None:
             message = f"{ending.message}; BUT {self._not_halted}: make sure that the device delivers no more pulses"
             ending = replace(ending, message=message)
+        left_out: dict[str, int] = {}
+        # A culture that is gone may not be able to count.
+        with suppress(Exception):
+            left_out = more_left_out(self._left_out, self._culture.left_out)
         try:
             # Read before writing: if the robot answers just now, its finished tick is among the written records.
             unfinished = self._driver.unfinished
             self._write()
             if unfinished is not None and unfinished.fields["stretch"] > self._outline.answered:
                 self._log.append(unfinished)
-            left_out = more_left_out(self._left_out, self._culture.left_out)
             fields = {"kind": "end", "by": ending.by, "message": ending.message, "left_out": left_out}
             self._log.append(Record(fields))
             self._log.sync()

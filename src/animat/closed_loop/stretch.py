@@ -18,6 +18,9 @@ from animat.recordings.recording import Channels
 from animat.responses.windows import read_windows
 from animat.stimulation.stimulus import Stimulus
 
+_MOST_CUT_S = 0.001
+"""By how much a response window may be cut: a device may report a pulse a few samples after it was due."""
+
 
 @dataclass(frozen=True, eq=False)
 class Request:
@@ -105,10 +108,12 @@ def check_answer(
             if not bool((returned_s[1:] >= returned_s[:-1]).all()):
                 return f"the culture returned {name} times that do not rise"
         # Counted from the start of the answer.
-        requested_s = requested_s - (start_s - since_s)
-        if bool((pulses_s < requested_s - 1.5 * sample_s).any()):
-            early_ms = 1000 * float((requested_s - pulses_s).max())
-            return f"the culture returned a stimulus {early_ms:.3g} ms before its requested time"
+        late_s = pulses_s - (requested_s - (start_s - since_s))
+        if bool((late_s < -1.5 * sample_s).any()):
+            return f"the culture returned a stimulus {-1000 * late_s.min():.3g} ms before its requested time"
+        if len(late_s) and seen_s < since_s + duration_s - start_s + late_s[-1] - _MOST_CUT_S:
+            late = f"{1000 * late_s[-1]:.3g} ms late"
+            return f"the culture delivered a stimulus {late}, but did not observe longer by as much after it"
         if channel.dtype.kind not in "iu":
             return f"the culture returned channels that are not whole numbers ({channel.dtype})"
         if len(channel) and not (channel.min() >= 0 and channel.max() < n_channels):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from animat.cultures.base import Culture
 from animat.cultures.virtual import VirtualCulture
 from animat.recordings.findings import Finding
@@ -56,6 +58,22 @@ def _other_virtual(recording: Recording, culture: VirtualCulture) -> tuple[str, 
         return "not of a virtual culture", here
     with_another = "" if "seed" in differ else f" with a different {' and '.join(differ)}"
     return f"of virtual culture {recorded.seed}{with_another}", here
+
+
+def other_channels(recording: Recording, culture: Culture) -> Finding | None:
+    """A warning where an open culture reads other electrodes than were recorded; else, or if those are unknown, None.
+
+    On a MaxOne some of the selected electrodes may not be routed, and not the same ones each time.
+    """
+    recorded = recording.channels.electrode
+    different = len(np.setxor1d(recorded, culture.channels.electrode))
+    if not different or np.any(recorded == UNKNOWN):
+        return None
+    message = (
+        f"{different:,} electrodes are read in the recordings or on this culture, but not in both: a response is the "
+        "mean over all channels, and percentiles are those of the recordings"
+    )
+    return Finding("other-channels", "warning", message, float(different))
 
 
 def other_patterns(recording: Recording, culture: Culture) -> Finding | None:

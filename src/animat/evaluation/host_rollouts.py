@@ -171,7 +171,8 @@ def _iteration(
 
     def of_actor(actor: Any, key: PRNGKeyArray, state: State) -> tuple[Array, State, Array]:
         n, n_drawn = len(state.iteration), environment.n_drawn
-        uniforms = jax.random.uniform(jax.random.fold_in(key, iteration), (n, n_drawn + environment.noise_size))
+        shape = n, n_drawn + environment.noise_size
+        uniforms = jax.random.uniform(jax.random.fold_in(key, iteration), shape, np.float32)
         observation = jax.vmap(environment.observe)(state) / environment.scales
         action = actor.act(environment, observation, uniforms[:, :n_drawn])
         delivered, answer, command = jax.vmap(environment.respond, (0, 0, 0, None))(

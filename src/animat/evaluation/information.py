@@ -142,7 +142,7 @@ def _at_each_goal(environment: Environment[Any], draws: int, states: Any, actors
     def of_actor(states: Any, actor: Actor, key: Any) -> Array:
         def at(state: Any, other: Any, key: Any) -> Array:
             seen = environment.observe(state._replace(robot=switched(state.robot, other)))
-            uniforms = jax.random.uniform(key, (draws, environment.n_drawn))
+            uniforms = jax.random.uniform(key, (draws, environment.n_drawn), jnp.float32)
             return actor.act(environment, jnp.tile(seen / environment.scales, (draws, 1)), uniforms)
 
         def with_others(number: Array, state: Any, key: Any) -> Array:

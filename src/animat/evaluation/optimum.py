@@ -197,7 +197,7 @@ def optimal_values(
 # At module level, so that it is compiled once, with the clock and without.
 @partial(jax.jit, static_argnums=(0, 1))
 def _step(environment: Environment[Any], episodes: int, key: Any, state: Any, action: Any, simulator: Any) -> Any:
-    uniforms = jax.random.uniform(key, (episodes, environment.noise_size))
+    uniforms = jax.random.uniform(key, (episodes, environment.noise_size), np.float32)
     return jax.vmap(environment.advance, (0, 0, 0, None))(uniforms, state, action, simulator)
 
 

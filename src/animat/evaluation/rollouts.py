@@ -238,7 +238,7 @@ def _roll_out(
 
     def iteration(carry: tuple[Any, ...], actor: Actor, key: PRNGKeyArray) -> tuple[Any, ...]:
         state, going, returns, lengths, presented, commanded, terminated = carry
-        uniforms = jax.random.uniform(key, (episodes, n_drawn + environment.noise_size))
+        uniforms = jax.random.uniform(key, (episodes, n_drawn + environment.noise_size), jnp.float32)
         observation = jax.vmap(environment.observe)(state) / environment.scales
         action = actor.act(environment, observation, uniforms[:, :n_drawn])
         after = jax.vmap(environment.advance, (0, 0, 0, None))(uniforms[:, n_drawn:], state, action, simulator)
@@ -248,7 +248,7 @@ def _roll_out(
         lengths = lengths + going
         if simulator is not None:
             delivered = going[:, None] & (after.info["delivered"][:, None] == jnp.arange(n_conditions))
-            presented = presented + delivered.sum(axis=0)
+            presented = presented + delivered.sum(axis=0, dtype=jnp.int32)
             commanded = commanded + jnp.tensordot(delivered.T.astype(jnp.float32), after.info["command"], 1)
         going = going & ~jnp.logical_or(*after.ended)
         return after.carried, going, returns, lengths, presented, commanded, terminated
@@ -295,7 +295,7 @@ def _trace(environment: Environment[Any], simulator: Neurons, actors: Actor, key
     def one_episode(actor: Actor, key: Any) -> Traces:
         def iteration(carry: Any, key: Any) -> Any:
             state, going = carry
-            uniforms = jax.random.uniform(key, (n_drawn + environment.noise_size,))
+            uniforms = jax.random.uniform(key, (n_drawn + environment.noise_size,), jnp.float32)
             observation = environment.observe(state) / environment.scales
             action = actor.act(environment, observation[None], uniforms[None, :n_drawn])[0]
             after = environment.advance(uniforms[n_drawn:], state, action, simulator)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import NamedTuple, Self
@@ -16,7 +17,7 @@ from animat.errors import InvalidArgument, counted, shown
 CONFIDENCE = 0.95
 OUTPERFORMED_P = 0.01
 """Policies count as better if p is below this, as in the paper's comparisons."""
-_MOST_PAIRS = 10_000
+MOST_PAIRS = 10_000
 """Pairs of samples up to which p is computed exactly: two groups of 100 take 0.1 s, and time and memory grow fast."""
 
 
@@ -93,21 +94,21 @@ def compare(first: ArrayLike, second: ArrayLike) -> Comparison:
     u_first, p_normal = mann_whitney(a, b)
     ties = len(np.unique(np.concatenate([a, b]))) < len(a) + len(b)
     total = len(a) * len(b)
-    p_exact = p_normal if total > _MOST_PAIRS else _exact_p(a, b)
+    p_exact = p_normal if total > MOST_PAIRS else _exact_p(a, b)
     high, low = (1 - 2 * share for share in _shares_within(u_first / total, len(a), len(b)))
     effect = Interval(1 - 2 * u_first / total, low, high, CONFIDENCE)
     return Comparison(min(u_first, total - u_first), u_first, len(a), len(b), p_normal, p_exact, effect, ties)
 
 
 def mann_whitney(first: Float64[np.ndarray, " n"], second: Float64[np.ndarray, " m"]) -> tuple[float, float]:
-    """The U of the first group, and the two-sided p by the normal approximation as in `compare`."""
+    """The U of the first group, and the two-sided p by the normal approximation as in `compare`; it is never 0."""
     from scipy.stats import mannwhitneyu
 
     if np.ptp(np.concatenate([first, second])) == 0:
         return len(first) * len(second) / 2, 1.0
     test = mannwhitneyu(first, second, alternative="two-sided", method="asymptotic")
-    # With the continuity correction p can exceed 1 if U is at its mean.
-    return float(test.statistic), min(1.0, float(test.pvalue))
+    # With the continuity correction p can exceed 1 if U is at its mean. Of groups of hundreds it can underflow to 0.
+    return float(test.statistic), min(1.0, max(float(test.pvalue), sys.float_info.min))
 
 
 def p_of_u(u: float, n_first: int, n_second: int) -> float:
@@ -325,6 +326,6 @@ class Verdict:
             least = min(each.wins for each in self.controls.values())
             parts.append(
                 f"the policies outperform every control (p < {OUTPERFORMED_P:g}; their return is larger in at least "
-                f"{100 * least:.0f} % of the pairs of episodes, ties counting half)"
+                f"{math.floor(100 * least + 1e-9)} % of the pairs of episodes, ties counting half)"
             )
         return "; ".join(parts)

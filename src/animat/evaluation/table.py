@@ -86,7 +86,7 @@ class Evaluation:
 
     @property
     def not_met(self) -> tuple[str, ...]:
-        """Names of the findings because of which a closed loop on the culture would not reach these returns."""
+        """Names of the findings because of which these returns cannot be expected of a closed loop on the culture."""
         return tuple(dict.fromkeys(f.name for f in self.findings if f.name in transfer.NAMES))
 
     def score(self, row: Row) -> float | None:
@@ -162,7 +162,7 @@ class Evaluation:
         if self.not_met:
             outlook = "it is not known whether a closed loop on the culture would reach these returns"
             if self.not_met != (transfer.UNKNOWN,):
-                outlook = "a closed loop on the culture would not reach these returns"
+                outlook = "these returns cannot be expected of a closed loop on the culture"
             lines.append(f"  {outlook}: see the warnings ({', '.join(self.not_met)})")
         lines += [f"  {finding.message}" for finding in self.findings if finding.name == "no-heuristic"]
         lines += self._optimum_lines()

@@ -108,7 +108,7 @@ def no_memory(noticed: Iterable[Finding], presentation: Presentation | None, *, 
         return
     blocked = presentation is not None and presentation.order == "blocked"
     remedy = "record with --order mixed" if blocked else "--simulator memory"
-    message = f"{remembers.message}: the measured return will differ from the prediction ({remedy})"
+    message = f"{remembers.message}: the measured return may differ from the prediction ({remedy})"
     yield Finding("no-memory", "warning", message, remembers.value)
 
 

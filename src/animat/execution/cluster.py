@@ -18,9 +18,10 @@ from typing import Any, ParamSpec, TypeVar, final
 from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch, first_line
 from animat.execution.dask_worker import VERSIONS_PREFIX, versions_tag, work
 from animat.execution.dispatch import LONGEST_S, Call, Dispatch
-from animat.execution.pinned import PinnedProcesses, own_cores
+from animat.execution.pinned import PinnedProcesses
 from animat.execution.task import Task, TaskResult, bring_back, carry_out_alone, carry_out_unshared
 from animat.extras import expect_extra
+from animat.process import own_cores
 
 P = ParamSpec("P")
 T = TypeVar("T")

@@ -20,8 +20,9 @@ from queue import SimpleQueue
 from typing import Any, TextIO
 
 from animat.errors import AnimatError, InvalidFile
-from animat.execution.pinned import PinnedProcesses, own_cores
+from animat.execution.pinned import PinnedProcesses
 from animat.execution.task import store
+from animat.process import own_cores
 
 VERSIONS_PREFIX, PLACE_PREFIX = "animat:", "animat-place:"
 """Prefixes of the resources whose names give a worker's software versions and its identity."""

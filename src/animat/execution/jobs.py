@@ -16,9 +16,10 @@ from pathlib import Path
 from animat.errors import AnimatError, InvalidArgument, counted, expect_at_least
 from animat.execution.cluster import Cluster
 from animat.execution.gpu import submit_with_gpu
-from animat.execution.pinned import PinnedProcesses, own_cores
+from animat.execution.pinned import PinnedProcesses
 from animat.execution.receipts import Receipt, digest_of, receipt_path
 from animat.execution.task import NOTICES, PLANNED, UNFINISHED, Task, TaskResult, carry_out_alone, memory_of, reported
+from animat.process import own_cores
 from animat.progress import Progress
 from animat.writing import write_whole
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import pickle
 import threading
 from collections.abc import Callable, Sequence
@@ -68,8 +67,3 @@ class PinnedProcesses(ThreadPoolExecutor):
                 process = self._local.process = Process("gpu" if self._local.core is None else self._local.core)
                 self._processes.append(process)
         return process.answer(call)
-
-
-def own_cores(most: int | None = None) -> list[int]:
-    """The cores that this process may use, at most `most` of them."""
-    return sorted(os.sched_getaffinity(0))[:most]

@@ -313,7 +313,7 @@ class _Run:
         line = {
             "at": datetime.now(UTC).isoformat(timespec="milliseconds"),
             "wall_s": round(time.monotonic() - self._wall_zero_s, 3),
-            "culture_min": round((self._now_s() - self._zero_s) / 60, 4),
+            "culture_min": round(self._now_s() / 60, 4),
             "what": what,
             **fields,
         }

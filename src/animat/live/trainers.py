@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import pickle
 import shutil
 import time
@@ -19,6 +18,7 @@ from animat.execution.pinned import PinnedProcesses
 from animat.execution.task import Task, TaskResult, carry_out, report, reported
 from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import SimulatorTimeline
+from animat.process import own_cores
 from animat.progress import Progress
 from animat.training.group import Group, SideBySide, save_policies
 from animat.writing import write_whole
@@ -114,7 +114,7 @@ class Trainers:
     def __enter__(self) -> Trainers:
         self.publish(0, self._groups[0].timeline)
         # The last cores first, to leave one to the process that records. All groups train at once, on any number.
-        cores = sorted(os.sched_getaffinity(0), reverse=True)
+        cores = own_cores()[::-1]
         self._executor = PinnedProcesses([cores[i % len(cores)] for i in range(len(self._groups))])
         for group in self._groups:
             task = TrainAlongside(group, self._exchange, KEEP_S)

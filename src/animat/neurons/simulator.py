@@ -89,7 +89,8 @@ class NeuronSimulator(abc.ABC):
         self, key: PRNGKeyArray, condition: Int[Array, ""], history: ArrayLike | tuple[float, float] = INITIAL_HISTORY
     ) -> Float[Array, "*readouts"]:
         """Draw one response x to a condition, in Hz per channel, after a history state (see `Answer`)."""
-        return self.answer(condition, jax.random.uniform(key), jnp.asarray(history, jnp.float32)).rate_hz
+        uniform = jax.random.uniform(key, dtype=jnp.float32)
+        return self.answer(condition, uniform, jnp.asarray(history, jnp.float32)).rate_hz
 
 
 @jax.tree_util.register_dataclass
@@ -305,7 +306,7 @@ def silenced(simulator: NeuronSimulator) -> EmpiricalSimulator:
 
 
 def indifferent(simulator: NeuronSimulator) -> EmpiricalSimulator:
-    """A culture that answers every condition with the pooled responses to all: random spikes at the same rates.
+    """A culture that answers every condition with the responses to all, those to each equally often: random spikes.
 
     Responses at 512 evenly spaced quantiles represent each condition, ignoring the history.
     """

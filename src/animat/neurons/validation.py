@@ -295,7 +295,8 @@ def validate(responses: Responses, *, kind: str | None = None, seed: int = 1, re
 def correlations(responses: Responses) -> Float64[np.ndarray, "2 pairs"]:
     """Spearman's correlation of every two readouts in the first half, which simulators keep, and in the second.
 
-    It is computed within conditions and averaged, weighted by trials. Pairs are (0, 1), (0, 2), ..., (1, 2), ...
+    It is computed within conditions and averaged, weighted by trials, over those in which both readouts vary; NaN if
+    there are none. Pairs are (0, 1), (0, 2), ..., (1, 2), ...
     """
     from scipy.stats import rankdata
 
@@ -307,8 +308,9 @@ def correlations(responses: Responses) -> Float64[np.ndarray, "2 pairs"]:
         of_condition = [rankdata(read_hz[condition == c], axis=0) for c in range(len(responses.conditions))]
         upper = np.triu_indices(read_hz.shape[1], 1)
         with np.errstate(invalid="ignore", divide="ignore"):  # NaN for a constant readout.
-            each = [np.corrcoef(ranks, rowvar=False)[upper] for ranks in of_condition]
-        of_halves.append(np.average(each, axis=0, weights=list(map(len, of_condition))))
+            each = np.array([np.corrcoef(ranks, rowvar=False)[upper] for ranks in of_condition])
+            weights = np.array([[len(ranks)] for ranks in of_condition]) * np.isfinite(each)
+            of_halves.append(np.nansum(weights * each, axis=0) / weights.sum(axis=0))
     return np.array(of_halves)
 
 

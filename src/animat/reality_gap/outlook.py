@@ -82,7 +82,9 @@ def outlook(
     settling = loop.settling or 0
     total_s += settling * (loop.pause_s + SETTLING_ROUNDS * float(interval_s.sum()))
     pulses += settling * SETTLING_ROUNDS * loop.pulses * int(gives.sum())
-    of, drift, since_min = account.budget.pulses, calibration.drift, calibration.start_min - now_min
+    of, drift = account.budget.pulses, calibration.drift
+    # A clock before the recording was restarted (a MaxOne's starts with each program): its age is not known.
+    since_min = min(0.0, calibration.start_min - now_min)
     return Outlook(
         total_s / 60,
         None if drift is None else tuple(since_min + each for each in drift.minutes_to(LARGE)),  # type: ignore[arg-type]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Hashable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
@@ -16,6 +15,7 @@ from jaxtyping import Float64
 from animat.environment import Environment
 from animat.evaluation.controls import Control, Delivered
 from animat.evaluation.rollouts import Episodes, Uniform
+from animat.process import own_cores
 from animat.progress import Progress, Silent
 from animat.reality_gap.calibration import Calibration
 from animat.reality_gap.session_responses import CommandSums
@@ -92,7 +92,7 @@ def predict(
     predictions: dict[str, Prediction] = {}
     # A hanging body on the host is only noticed in the main thread (`animat.robots.host.time_limit`).
     on_host = isinstance(environment.robot, HostRobot)
-    with nullcontext() if on_host else ThreadPoolExecutor(len(os.sched_getaffinity(0))) as executor:
+    with nullcontext() if on_host else ThreadPoolExecutor(len(own_cores())) as executor:
         side_by_side = map if executor is None else executor.map
         # First one of each kind: two of a kind that start at the same time would both be compiled.
         progress.update(0, len(acting), "compiling")

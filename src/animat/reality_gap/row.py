@@ -136,12 +136,11 @@ def resampled_means(
 ) -> Float64[np.ndarray, " resamples"] | None:
     """Means of bootstrap samples of returns, spread as far as Student's t is beyond the normal distribution.
 
-       From a few episodes, the usual percentile interval contains the true mean too rarely: from two half of the time.
-       Episodes of different agents with the same start are as easy, or as hard: all of them are drawn, or none.
-    There are
-       none for fewer than two episodes, or turns (as in a `Row`).
+    From a few episodes, the usual percentile interval contains the true mean too rarely: from two half of the time.
+    Episodes of different agents with the same start are as easy, or as hard: all of them are drawn, or none. There are
+    none for fewer than two episodes, or turns (as in a `Row`).
 
-       Source: the expanded percentile interval of Hesterberg 2015, doi:10.1080/00031305.2015.1089789.
+    Source: the expanded percentile interval of Hesterberg 2015, doi:10.1080/00031305.2015.1089789.
     """
     from scipy.stats import norm, t
 

@@ -193,8 +193,8 @@ def run_policies(
         wait([] if optimum is None else [optimum])
         raise
     best = None
-    # A user who stopped the session does not wait for it.
-    if optimum is not None and (optimum.done() or session.ending.by == "plan"):
+    # A user who stopped the session does not wait for it; after any other ending the program would exit meanwhile.
+    if optimum is not None and (optimum.done() or session.ending.by != "person"):
         try:
             best = wait_for_optimum(optimum, progress)
         except Exception as error:

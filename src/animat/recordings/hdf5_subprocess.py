@@ -12,6 +12,7 @@ import os
 import pickle
 import threading
 from concurrent.futures import BrokenExecutor
+from contextlib import suppress
 from pathlib import Path
 
 from animat.errors import AnimatError, InvalidFile, first_line
@@ -91,8 +92,10 @@ def _limit(path: Path) -> None:
     size = path.stat().st_size
     used = resource.getrusage(resource.RUSAGE_SELF)
     seconds = used.ru_utime + used.ru_stime + PROCESSOR_S + PROCESSOR_S_PER_MB * size / 1e6
-    in_use = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-    memory = in_use + MEMORY_BYTES + MEMORY_PER_BYTE * size
-    for kind, limit in ((resource.RLIMIT_CPU, math.ceil(seconds)), (resource.RLIMIT_AS, memory)):
+    limits = {resource.RLIMIT_CPU: math.ceil(seconds)}
+    with suppress(FileNotFoundError):  # Only Linux tells, and limits, the memory in use.
+        in_use = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+        limits[resource.RLIMIT_AS] = in_use + MEMORY_BYTES + MEMORY_PER_BYTE * size
+    for kind, limit in limits.items():
         _, hard = resource.getrlimit(kind)
         resource.setrlimit(kind, (limit if hard < 0 else min(limit, hard), hard))

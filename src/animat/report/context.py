@@ -18,8 +18,7 @@ def draw_context(rows: Mapping[str, Sequence[ContextRow]]) -> Figure:
     left, right = figure.subplots(1, 2, sharey=True)
     style_axes(left, "The task: is a reflex enough?", "context gap (0: a reflex does it all, 1: it does nothing)", "")
     style_axes(right, "The policies: more than a reflex?", "context score (0: the best reflex, 1: optimal)", "")
-    label = f"from {CONTEXT_GAP_LEVEL:g} on: needs context"
-    left.axvline(CONTEXT_GAP_LEVEL, color=ORANGE, linewidth=1, linestyle="--", label=label)
+    left.axvline(CONTEXT_GAP_LEVEL, color=ORANGE, linewidth=1, linestyle="--", label="a reflex leaves half undone")
     for axes, name, colour in ((left, "gap", BLUE), (right, "score", BLACK)):
         axes.axvline(0, color=GREY, linewidth=0.8)
         nothing = "not known" if axes is left else "none: no task beyond a reflex, or not known"

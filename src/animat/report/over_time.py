@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float64
 
+from animat.evaluation.statistics import CONFIDENCE
 from animat.lazy import Figure
 from animat.report.style import BLUE, GREY, OPTIMUM, PALETTE, add_common_legend, grid_of_panels, style_axes, wrapped
 
-_RESAMPLES = 2000
 _NARROW_IN, _WIDE_IN = 3.1, 4.6
 """Widths of a panel with a learning curve, and of one with returns at every recording."""
 _MOST_ARMS = len(PALETTE)
@@ -27,6 +27,7 @@ class LearningCurve:
         returns: mean return of the episodes that ended by then (`over_rounds`), NaN if not known.
         random, optimum: return of random actions and optimal return with the simulator in use in each chunk, NaN if not
             known; None if known for no chunk.
+        within: the lowest and the highest possible return, which limit intervals.
     """
 
     name: str
@@ -34,25 +35,26 @@ class LearningCurve:
     returns: Float64[np.ndarray, "policies chunks"]
     random: Float64[np.ndarray, " chunks"] | None = None
     optimum: Float64[np.ndarray, " chunks"] | None = None
+    within: tuple[float, float] = (-np.inf, np.inf)
 
     def mean_with_interval(self) -> Float64[np.ndarray, "3 chunks"]:
-        """The mean over policies in each chunk and its 95 % bootstrap interval; NaN if no episode of any policy ended.
+        """The mean over policies in each chunk and its 95 % interval by Student's t.
 
-        The same resampled policies are used in all chunks, as each policy is one sample.
+        The mean is NaN if no episode of any policy ended, the interval if episodes of fewer than two did.
         """
-        n, known = len(self.returns), np.isfinite(self.returns)
-        filled = np.where(known, self.returns, 0.0)
-        counts = np.random.default_rng(0).multinomial(n, np.full(n, 1 / n), _RESAMPLES)
+        from scipy.stats import t
+
+        known, (lowest, highest) = np.isfinite(self.returns), self.within
+        n = known.sum(axis=0)
         with np.errstate(invalid="ignore", divide="ignore"):
-            mean = filled.sum(axis=0) / known.sum(axis=0)
-            resampled = (counts @ filled) / (counts @ known)
-        # Where no episode of the resampled policies ended, the mean replaces theirs.
-        low_high = np.quantile(np.where(np.isfinite(resampled), resampled, mean), [0.025, 0.975], axis=0)
-        return np.stack([mean, *low_high])
+            mean = np.where(known, self.returns, 0.0).sum(axis=0) / n
+            variance = (np.where(known, self.returns - mean, 0.0) ** 2).sum(axis=0) / (n - 1)
+            half = t.ppf((1 + CONFIDENCE) / 2, n - 1) * np.sqrt(variance / n)
+        return np.stack([mean, np.maximum(mean - half, lowest), np.minimum(mean + half, highest)])
 
 
 def draw_learning_curves(curves: Sequence[LearningCurve], title: str) -> Figure:
-    """One panel per arm: policies, their mean with its 95 % bootstrap interval, random actions and the optimum."""
+    """One panel per arm: policies, their mean with its 95 % interval, random actions and the optimum."""
     columns = 2 if len(curves) == 4 else min(3, len(curves))
     figure, panels = grid_of_panels(len(curves), columns, _NARROW_IN, 2.4, title, share_x=True, share_y=True)
     for axes, curve in zip(panels, curves, strict=True):
@@ -63,8 +65,9 @@ def draw_learning_curves(curves: Sequence[LearningCurve], title: str) -> Figure:
         # Parts in which no episode of any policy ended are skipped, not drawn as gaps.
         mean, low, high = curve.mean_with_interval()
         some = np.isfinite(mean)
-        label = "95 % interval of the mean"
-        axes.fill_between(x[some], low[some], high[some], color=BLUE, alpha=0.3, linewidth=0, label=label)
+        if np.isfinite(low).any():
+            label = "95 % interval of the mean"
+            axes.fill_between(x[some], low[some], high[some], color=BLUE, alpha=0.3, linewidth=0, label=label)
         single = "o" if np.count_nonzero(some) == 1 else ""
         axes.plot(x[some], mean[some], color=BLUE, linewidth=1.5, marker=single, label="mean of the policies")
         for name, levels, colour, line in (

@@ -10,7 +10,7 @@ from animat.recordings.findings import Finding
 TRAINED = "trained: "
 """Precedes an arm's name among the controls."""
 CONTEXT_GAP_LEVEL = 0.5
-"""The context gap from which a task counts as needing more than a reflex."""
+"""The context gap from which a reflex leaves half of a task undone."""
 
 
 @dataclass(frozen=True)
@@ -248,8 +248,8 @@ class ContextRow:
         return self.best_known is not None
 
     @property
-    def needs_context(self) -> bool:
-        """Whether a reflex leaves half of the task undone."""
+    def leaves_half(self) -> bool:
+        """Whether a reflex leaves half of the task or more undone."""
         return self.gap is not None and self.gap >= CONTEXT_GAP_LEVEL
 
     @property

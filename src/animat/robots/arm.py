@@ -136,7 +136,7 @@ class TwoLinkArm(Robot[ArmState]):
 
     def reset(self, key: Array) -> ArmState:
         """At rest, the upper link to the right and the elbow bent downwards; the target is drawn."""
-        outwards, around = jax.random.uniform(key, (2,))
+        outwards, around = jax.random.uniform(key, (2,), jnp.float32)
         nearest_m, farthest_m = self._target_distances_m
         distance_m = jnp.sqrt(nearest_m**2 + outwards * (farthest_m**2 - nearest_m**2))
         direction = 2 * math.pi * around

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from pydantic import BeforeValidator, Field
 
 from animat.errors import InvalidArgument, shown
-from animat.lazy import Array, jax
+from animat.lazy import Array, jax, jnp
 from animat.records import Number, Whole
 
 State = TypeVar("State")
@@ -163,7 +163,7 @@ class Robot(abc.ABC, Generic[State]):
     @final
     def step(self, key: Array, state: State, u: Float[Array, "*commands"]) -> Transition[State]:
         """One iteration with random numbers drawn from `key`; arguments and results as in `advance`."""
-        return self.advance(jax.random.uniform(key, (self.noise_size,)), state, u)
+        return self.advance(jax.random.uniform(key, (self.noise_size,), jnp.float32), state, u)
 
     def caveats(self) -> tuple[str, ...]:
         """Warnings to consider before trusting results with these parameters, one sentence each; usually none."""

@@ -130,7 +130,7 @@ class Wheels(Robot[WheelsState]):
         """At the start, with a random heading and goal."""
         for_goal, for_heading = jax.random.split(key)
         goal = jnp.asarray(self._goals_m, jnp.float32)[jax.random.randint(for_goal, (), 0, len(self._goals_m))]
-        heading = math.pi * (1 - 2 * jax.random.uniform(for_heading))
+        heading = math.pi * (1 - 2 * jax.random.uniform(for_heading, (), jnp.float32))
         return WheelsState(jnp.float32(self.start_x_m), jnp.float32(self.start_y_m), heading, goal[0], goal[1])
 
     def advance(self, uniforms: Uniforms, state: WheelsState, u: Float[Array, "2"]) -> Transition[WheelsState]:

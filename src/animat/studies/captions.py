@@ -40,7 +40,8 @@ CULTURE = {
     "psth": Caption(
         "post-stimulus time histogram",
         "Mean rate per channel against the time from the stimulus (the last pulse of a trial), over all stimuli of the "
-        "first recording, whose number is given above. Responses are read in the shaded window.",
+        "first recording, whose number is given above. Responses are read in the shaded window. Where stimuli follow "
+        "each other closely, later and earlier peaks are those of other stimuli.",
         ("tables/culture-psth.csv",),
     ),
     "bursts": Caption(
@@ -68,8 +69,8 @@ CULTURE = {
     "drift": Caption(
         "drift",
         "Above: percentiles of all non-burst responses. Middle: how often the response to each stimulus exceeds their "
-        "median; curves that converge mean that control is lost. Below: the share of bursts. {recordings} "
-        "of about {responses} each.",
+        "median; curves that converge mean that control is lost. Below: the share of bursts, 0 where none can be set "
+        "apart. {recordings} of about {responses} each.",
         ("tables/culture-drift.csv", "tables/culture-conditions.csv"),
     ),
 }
@@ -85,12 +86,12 @@ ROBOT = {
     "learning": Caption(
         "learning curves",
         "Return against iterations of training; up is better. Thin: each policy ({policies}). Thick: their mean "
-        "with its 95 % bootstrap interval. Each point is the mean over the episodes that ended within the {round} "
+        "with its 95 % interval by Student's t. Each point is the mean over the episodes that ended within the {round} "
         "iterations before, in which every environment ends at least one. Curves begin there, because the first "
         "episodes to end are not a representative sample. Actions are drawn. Lines: random actions and the optimal "
-        "return with the simulator in use, which changes with it (from the second recording on: on a coarse grid). A "
-        "control has no such return: whatever it chooses is as good as random. An arm whose episodes draw their "
-        "recording has no lines, as it has no one simulator in use.",
+        "return with the simulator in use, which changes with it (from the second recording on: on a coarse grid, and "
+        "only for mappings with steps, not for linear). A control has no such return: whatever it chooses is as good "
+        "as random. An arm whose episodes draw their recording has no lines, as it has no one simulator in use.",
         ("tables/{of}-learning.csv", "tables/learning-curves.csv"),
     ),
     "comparisons": Caption(

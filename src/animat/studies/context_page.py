@@ -25,7 +25,7 @@ def write_context_page(study: ContextStudy, found: ContextRun) -> Path:
         "context",
         "Context gaps and context scores",
         "Left: how much of a task the best reflex leaves undone, (optimal return − best coupling) / (optimal return − "
-        f"random); from the dashed line on, a task counts as needing context. Right: how far the {study.policies} "
+        f"random); from the dashed line on, half of it or more. Right: how far the {study.policies} "
         "policies get from that reflex to the optimum. Each point is a culture, with its 95 % interval on the "
         "culture's simulator; an interval that reaches the frame extends beyond it. Triangles: lower bounds, as the "
         "optimal return is not known.",
@@ -77,28 +77,30 @@ def _beats_random(row: ContextRow) -> bool:
 
 
 def summarise_cultures(by_robot: Mapping[str, Sequence[ContextRow]]) -> str:
-    """Two sentences on all robots: which tasks need more than a reflex, and where the policies do more."""
-    needs = [robot for robot, rows in by_robot.items() if rows and all(row.needs_context for row in rows)]
+    """Two sentences on all robots: of which tasks a reflex leaves half undone, and where the policies do more."""
+    halves = [robot for robot, rows in by_robot.items() if rows and all(row.leaves_half for row in rows)]
     has = [robot for robot, rows in by_robot.items() if rows and all(row.has_context for row in rows)]
     return (
-        f"The task needs more than a reflex on every culture for {', '.join(needs) or 'no robot'}. The policies do "
-        f"significantly more than the best reflex on every culture for {', '.join(has) or 'no robot'}."
+        f"A reflex leaves half of the task or more undone on every culture for {', '.join(halves) or 'no robot'}. The "
+        f"policies do significantly more than the best reflex on every culture for {', '.join(has) or 'no robot'}."
     )
 
 
 def summarise_robot(rows: Sequence[ContextRow]) -> str:
-    """Two sentences on one robot on all cultures: what the task needs, and what the policies do."""
+    """Two sentences on one robot on all cultures: what a reflex leaves undone, and what the policies do."""
     gaps = [row.gap for row in rows if row.gap is not None]
     if not gaps:
         return "The context gap is not known."
-    n, needs, has = len(gaps), sum(row.needs_context for row in rows), sum(row.has_context for row in rows)
+    n, halves, has = len(gaps), sum(row.leaves_half for row in rows), sum(row.has_context for row in rows)
     least = "at least " if any(row.is_least for row in rows) else ""
     between = f" (context gap {least}{_range(gaps)})"
     unknown = f"; on {len(rows) - n} more this is not known" if n < len(rows) else ""
-    task = f"A reflex leaves half of the task or more undone on {needs} of {counted(n, 'culture')}{between}{unknown}."
+    task = f"A reflex leaves half of the task or more undone on {halves} of {counted(n, 'culture')}{between}{unknown}."
     scores = [row.score for row in rows if row.score is not None]
-    scored = f" (context score {least}{_range(scores)})" if scores else ""
-    return f"{task} The policies do significantly more than the best reflex on {has} of {n}{scored}."
+    if not scores:
+        return f"{task} No culture has a context score."
+    of = f"{has} of {counted(len(scores), 'culture')} with a context score ({least}{_range(scores)})"
+    return f"{task} The policies do significantly more than the best reflex on {of}."
 
 
 def _range(values: Sequence[float]) -> str:

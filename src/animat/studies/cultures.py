@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -16,11 +17,13 @@ import numpy as np
 from jaxtyping import Float64
 
 from animat.errors import AnimatError, counted
+from animat.evaluation.statistics import CONFIDENCE
 from animat.execution.cluster import Cluster
 from animat.execution.gpu import find_gpu
 from animat.execution.jobs import expect_workers
-from animat.execution.pinned import PinnedProcesses, own_cores
+from animat.execution.pinned import PinnedProcesses
 from animat.folders import expect_no_other
+from animat.process import own_cores
 from animat.progress import Progress, Silent
 from animat.report.headline import draw_over_cultures
 from animat.report.html import Section, cell, columns_of, picture_of, table_of, write_page
@@ -35,7 +38,6 @@ from animat.studies.specification import Compared, Study
 from animat.studies.tabulating import LEVEL, SECOND, TOO_FEW
 from animat.writing import exclusive_lock, write_whole
 
-RESAMPLES = 10_000
 MOST_AT_ONCE = 64
 """Cultures: each has a thread here, which manages its jobs."""
 COMPARISONS, SUMMARY, SCORES = "comparisons.csv", "over-cultures.csv", "scores.csv"
@@ -194,7 +196,7 @@ def over_cultures(comparisons: Sequence[Sequence[ComparedReturns]]) -> tuple[Ove
     found = []
     for rows in zip(*comparisons, strict=True):
         first, second = np.array([row.mean_first for row in rows]), np.array([row.mean_second for row in rows])
-        low, high = bootstrap_interval(second - first) if len(rows) > 1 else (None, None)
+        low, high = interval_of_mean(second - first) if len(rows) > 1 else (None, None)
         found.append(
             OverCultures(
                 comparison=rows[0].comparison,
@@ -213,11 +215,12 @@ def over_cultures(comparisons: Sequence[Sequence[ComparedReturns]]) -> tuple[Ove
     return tuple(found)
 
 
-def bootstrap_interval(values: Float64[np.ndarray, " cultures"]) -> tuple[float, float]:
-    """The 95 % percentile bootstrap interval of the mean; deterministic."""
-    drawn = np.random.default_rng(0).integers(len(values), size=(RESAMPLES, len(values)))
-    low, high = np.quantile(values[drawn].mean(axis=1), (0.025, 0.975))
-    return float(low), float(high)
+def interval_of_mean(values: Float64[np.ndarray, " cultures"]) -> tuple[float, float]:
+    """The 95 % interval of the mean of two or more values by Student's t."""
+    from scipy.stats import t
+
+    half = t.ppf((1 + CONFIDENCE) / 2, len(values) - 1) * values.std(ddof=1) / math.sqrt(len(values))
+    return float(values.mean() - half), float(values.mean() + half)
 
 
 def write_cultures_page(study: Study, found: CulturesRun) -> Path:
@@ -257,8 +260,8 @@ def _summary(study: Study, found: CulturesRun) -> Section:
             ("second mean larger in", lambda row: f"{row.larger_in} of {row.cultures}"),
             ("significantly better in", "found_better"),
         ],
-        note="Mean returns; each culture counts the same. Intervals are percentile bootstraps over cultures, too "
-        "narrow with fewer than ten. Second mean larger in: cultures in which the second arm's mean return is larger. "
+        note="Mean returns; each culture counts the same. Intervals are by Student's t over cultures. "
+        "Second mean larger in: cultures in which the second arm's mean return is larger. "
         f"Significantly better in: those in which it is better at p < {LEVEL:g}, as in their own reports.",
         beside=SUMMARY,
     )

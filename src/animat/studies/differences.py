@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
+from animat.errors import counted
 from animat.evaluation.statistics import p_of_u
 from animat.neurons.fidelity import LARGEST_LOSS
 from animat.report.results import ComparedReturns
@@ -192,7 +193,10 @@ def explain(row: ComparedReturns) -> str:
     n = row.n
     smallest = p_of_u(0.0, n, n)
     if smallest >= LEVEL:
-        return f"With {n} policies per side p cannot fall below {smallest:.2g}, however they differ: use more policies."
+        return (
+            f"With {counted(n, 'policy', 'policies')} per side p cannot fall below {smallest:.2g}, unless some have "
+            "equal returns: use more policies."
+        )
     first, second, random = row.optimum_first, row.optimum_second, row.random_second
     if second is None or random is None:
         return "There is no optimum to compare with."

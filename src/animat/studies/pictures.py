@@ -148,7 +148,7 @@ def _curves(known: References, coarse: References, timeline: SimulatorTimeline |
         levels = np.array(random, np.float64), np.array(optimum, np.float64)
         iterations = learning[0, :, 0]
         returns = over_rounds(iterations, learning[:, :, 1], learning[:, :, 2], round_of(study, known.spec))
-        curves.append(LearningCurve(arm.name, iterations, returns, *levels))
+        curves.append(LearningCurve(arm.name, iterations, returns, *levels, known.spec.robot().return_range))
     return curves
 
 

@@ -29,7 +29,7 @@ from animat.studies.pictures import round_of
 from animat.studies.recording import controllability, read_series
 from animat.studies.results import read_typed
 from animat.studies.specification import Arm, Study
-from animat.studies.tabulating import FIRST, LEFT_OUT, LEVEL, NONE, SECOND, all_episodes, performances
+from animat.studies.tabulating import FIRST, LEFT_OUT, LEVEL, NONE, SECOND, TOO_FEW, all_episodes, performances
 from animat.studies.task import StudyTask
 from animat.studies.toml import study_to_toml
 
@@ -109,6 +109,8 @@ def _and(parts: Sequence[str]) -> str:
 
 def _found_better(rows: Sequence[ComparedReturns]) -> str:
     found = sum(row.outcome == SECOND for row in rows)
+    if all(row.outcome == TOO_FEW for row in rows):
+        return "With so few policies it is not known whether the second arm is better."
     if len(rows) == 1:
         return f"The second arm was {'' if found else 'not '}found to be better."
     return f"In {found} of {len(rows)} comparisons the second arm was found to be better."
@@ -141,8 +143,8 @@ def _summary(study: Study, results: Results, headline: Sequence[Score], picture:
     smallest = p_of_u(0.0, study.policies, study.policies)
     if rows and smallest >= LEVEL:
         sentences.append(
-            f"With {study.policies} policies per side p cannot fall below {smallest:.2g}: this is a first look, not a "
-            "result."
+            f"With {counted(study.policies, 'policy', 'policies')} per side p cannot fall below {smallest:.2g}, unless "
+            "some have equal returns: this is a first look, not a result."
         )
     return Section("Results in short", tuple(sentences), pictures=(picture,), tables=(arms_table(study),))
 

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from animat.evaluation.statistics import MOST_PAIRS, OUTPERFORMED_P
 from animat.neurons.fidelity import LARGEST_LOSS, Fidelity
 from animat.report.html import Columns, Table, cell, columns_of, table_of, with_error
 from animat.report.results import ComparedReturns, Results, StudyOptimum
@@ -32,7 +33,7 @@ def comparisons_table(rows: Sequence[ComparedReturns]) -> Table:
         *columns_of("comparison", "robot", "at_min", "n"),
         ("U", "u"),
         ("p", "p_normal"),
-        ("p exact", "p_exact"),
+        ("p exact", lambda row: row.p_exact if row.n**2 <= MOST_PAIRS else None),
         ("p corrected", "p_holm"),
         ("effect", _interval("effect", "effect_low_95", "effect_high_95")),
         ("outcome", _outcome),
@@ -208,7 +209,8 @@ def heuristic_table(results: Results) -> Table:
             ("the policies", "outcome"),
         ],
         note="p: Mann-Whitney over episodes, two-sided. Pairs won: share of pairs of episodes in which the policies' "
-        "return is larger, ties counting half. Highlighted: learning did no better than the heuristic policy.",
+        "return is larger, ties counting half. Highlighted: the policies are not shown to outperform it at "
+        f"p < {OUTPERFORMED_P:g}.",
         beside="tables/heuristic.csv",
         marked=tuple(i for i, row in enumerate(results.heuristic) if row.outcome == NOT),
     )

@@ -79,7 +79,9 @@ def train_groups(
     Raises:
         InvalidFile: if the checkpoint cannot be read or written, or is of another training.
     """
-    together = SideBySide(*groups)
+    # In 32 bits, even where the user's own code computes in 64: learners and checkpoints have one precision.
+    with jax.enable_x64(False):
+        together = SideBySide(*groups)
     done = together.resume(checkpoint) if checkpoint is not None and checkpoint.exists() else 0
     simulators = [_simulators_of(group) for group in groups]
 
@@ -92,7 +94,8 @@ def train_groups(
         pass_on(chunk)
     written = time.monotonic()
     for index in range(done, CHUNKS):
-        mean_return = together.train(index, *(simulator_at(index) for simulator_at in simulators))
+        with jax.enable_x64(False):
+            mean_return = together.train(index, *(simulator_at(index) for simulator_at in simulators))
         pass_on(together.curve[-1])
         is_due = time.monotonic() - written > checkpoint_s or (keeps_last and index + 1 == CHUNKS)
         if checkpoint is not None and is_due:

@@ -15,9 +15,10 @@ from pathlib import Path
 
 from animat.errors import InvalidFile, UnusableData
 from animat.execution.jobs import Job, Jobs, expect_workers
-from animat.execution.pinned import PinnedProcesses, own_cores
+from animat.execution.pinned import PinnedProcesses
 from animat.execution.task import UNFINISHED
 from animat.folders import with_fingerprint
+from animat.process import own_cores
 from animat.progress import Part, Progress, Silent
 from animat.studies.folder import OWN_FOLDERS, RECEIPTS, claim_folder, describe_study, hash_files, source_files
 from animat.studies.recording import JOB, Record

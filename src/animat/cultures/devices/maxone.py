@@ -171,9 +171,10 @@ class MaxOneCulture(Culture):
 
     @property
     def left_out(self) -> dict[str, int]:
-        """Spikes on amplifiers that read no electrode of the selection, and frames lost in transmission."""
-        lost = int(getattr(self._stream, "lost_frames", 0))
-        return {"spikes on amplifiers without an electrode": self.spikes_not_recorded, "frames lost on the way": lost}
+        """Spikes on amplifiers that read no electrode of the selection, and what the stream lost."""
+        lost, late = (int(getattr(self._stream, name, 0)) for name in ("lost_frames", "late_spikes"))
+        counts = {"spikes on amplifiers without an electrode": self.spikes_not_recorded}
+        return counts | {"frames lost on the way": lost, "spikes reported late": late}
 
     def _open(self) -> None:
         self._mx = mx = vendor_module("maxlab", _NO_MODULE)

@@ -50,7 +50,7 @@ class ZmqSpikes:
     """The stream of MaxLab Live's server through ZeroMQ (the package pyzmq), read by a thread.
 
     A message has up to three parts: the frame's number, the samples of all channels, and the spikes of that frame.
-    Frames lost in transmission are counted in `lost_frames`.
+    Frames lost in transmission are counted in `lost_frames`, spikes that came after theirs were taken in `late_spikes`.
     """
 
     def __init__(self, address: str = ADDRESS) -> None:
@@ -62,12 +62,13 @@ class ZmqSpikes:
         self._thread: threading.Thread | None = None
         self._going = threading.Event()
         self._failed: Exception | None = None
-        self.lost_frames = 0
+        self.lost_frames = self.late_spikes = self._taken = 0
 
     def start(self) -> None:
         missing = "culture: expected the package pyzmq to read a maxone, which is not installed"
         zmq = vendor_module("zmq", f"{missing}: {pip_install('pyzmq')}")
-        self._frame, self._failed, self.lost_frames = -1, None, 0
+        self._frame, self._failed = -1, None
+        self.lost_frames = self.late_spikes = self._taken = 0
         self._spikes.clear()
         self._going.set()
         self._came_s = time.monotonic()
@@ -102,6 +103,8 @@ class ZmqSpikes:
         # Check all spikes, as they may be out of order; the listener may add some meanwhile.
         spikes = [self._spikes.popleft() for _ in range(len(self._spikes))]
         self._spikes.extendleft(spike for spike in reversed(spikes) if spike[0] >= stop)
+        self.late_spikes += sum(spike[0] < self._taken for spike in spikes)
+        self._taken = stop
         table = np.array([spike for spike in spikes if start <= spike[0] < stop], dtype=np.int64).reshape(-1, 2)
         return table[:, 0], table[:, 1]
 

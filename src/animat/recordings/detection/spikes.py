@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ from jaxtyping import Float32, Float64, Int64
 from scipy import fft, signal
 
 from animat.errors import InvalidArgument
+from animat.process import own_cores
 from animat.progress import Progress, Silent
 from animat.recordings.detection.artefacts import Counts, Flags, Levels, Pulses, Traces
 from animat.recordings.detection.pieces import Piece, read_piece
@@ -83,7 +83,7 @@ def detect_spikes(
     times_s = np.asarray([] if stimulus_time_s is None else stimulus_time_s, np.float64)
     # Simultaneous pulses are one.
     stimulus = np.unique(np.rint((times_s - traces.start_s) * rate_hz)).astype(np.int64)
-    workers = workers or len(os.sched_getaffinity(0))
+    workers = workers or len(own_cores())
     noise_uv, level_uv = _noise_and_level_uv(traces, stimulus, settings, workers)
     length = max(round(settings.chunk_s * rate_hz), 1)
 

@@ -89,8 +89,8 @@ def _with_gaps(file: Hdf5File, traces: RawTraces, frame: Int64[np.ndarray, " sam
     """The traces with NaN for the frames that the rig lost; `frame` is the number of each sample, from 0 on."""
     if len(frame) != traces.samples or np.any(np.diff(frame) <= 0) or frame[-1] > 100 * len(frame):
         raise InvalidFile(
-            f"{file.path}: expected rising frame_nos for {traces.samples:,} samples, got {len(frame):,} up to "
-            f"{frame[-1]:,} that do not rise or belong to others: damaged; copy or record it again"
+            f"{file.path}: expected rising frame_nos or timestamps for {traces.samples:,} samples, got {len(frame):,} "
+            f"up to frame {frame[-1]:,} that do not rise or belong to others: damaged; copy or record it again"
         )
 
     def read_uv(start: int, stop: int) -> Float32[np.ndarray, "samples channels"]:
@@ -109,9 +109,12 @@ def _nwb(file: Hdf5File, part: str | None, base: Recording) -> RawTraces:
     if not series:
         raise InvalidFile(f"{path}: expected raw traces as an ElectricalSeries in /acquisition, found none")
     at = f"acquisition/{choose(f'{path}: series', '--part', series, part, commands='animat convert')}"
-    rate_hz = file.attribute(f"{at}/starting_time", "rate")
+    rate_hz, start_s = file.attribute(f"{at}/starting_time", "rate"), float(file.first(f"{at}/starting_time") or 0.0)
+    frame = None
+    if file.has(f"{at}/timestamps"):
+        rate_hz, start_s, frame = _timed(file, f"{at}/timestamps")
     if not is_positive(rate_hz):
-        raise InvalidFile(f"{path}: expected the rate of /{at} in Hz at its starting_time, found none")
+        raise InvalidFile(f"{path}: expected timestamps of /{at}, or a rate in Hz at its starting_time, found none")
     labels = None
     if file.has(f"{at}/electrodes"):
         rows = file.read(f"{at}/electrodes").astype(np.int64)
@@ -120,9 +123,21 @@ def _nwb(file: Hdf5File, part: str | None, base: Recording) -> RawTraces:
     scale: Scale = 1e6 * _number(file.attribute(f"{at}/data", "conversion"), 1.0)
     if file.has(f"{at}/channel_conversion"):
         scale = scale * file.read(f"{at}/channel_conversion").astype(np.float64).reshape(-1)
-    start_s = float(file.first(f"{at}/starting_time") or 0.0)
     base = replace(base, sampling_rate_hz=float(rate_hz))
-    return _traces(file, f"{at}/data", base, scale, start_s=start_s, labels=labels)
+    traces = _traces(file, f"{at}/data", base, scale, start_s=start_s, labels=labels)
+    return traces if frame is None else _with_gaps(file, traces, frame)
+
+
+def _timed(file: Hdf5File, at: str) -> tuple[float, float, Int64[np.ndarray, " samples"]]:
+    """The rate of samples with timestamps, in Hz, the time of the first, and the number of each, gaps included."""
+    time_s = file.read(at).astype(np.float64).reshape(-1)
+    step_s = np.diff(time_s)
+    usual_s = float(np.median(step_s)) if len(step_s) else 0.0
+    if not usual_s > 0 or not np.isfinite(time_s).all():
+        raise InvalidFile(f"{file.path}: expected two or more rising times in s at /{at}, got {len(time_s):,} others")
+    # Timestamps are rounded; the mean over all steps but gaps is not.
+    rate_hz = 1 / float(np.mean(step_s[np.abs(step_s - usual_s) < 0.5 * usual_s]))
+    return rate_hz, float(time_s[0]), np.insert(np.cumsum(np.rint(step_s * rate_hz)), 0, 0).astype(np.int64)
 
 
 def _traces(

@@ -74,6 +74,7 @@ def artefact_findings(
     if artefact.any():
         from_ms, to_ms = edges_ms[:-1][artefact][0], edges_ms[1:][artefact][-1]
         spikes, reaches = float(count[artefact].sum()), to_ms > window_ms[0] + 1e-9
+        every_pulse = post_stimulus_histogram(recording, *SPAN_MS, BIN_MS, ~stimuli.is_rest).count[artefact].sum()
         remedy = f"the window from {window_ms[0]:g} ms on does not contain them"
         if reaches:
             begin = "" if is_elsewhere else f": begin it at {to_ms:g} ms or later (--window-ms)"
@@ -82,7 +83,7 @@ def artefact_findings(
             f"from {from_ms:g} to {to_ms:g} ms there are {spikes / n_stimuli:.1f} spikes per stimulus, "
             f"{spikes / (usual * artefact.sum()):.3g} times as many as is usual in as much time: an artefact counted "
             f"as spikes{'' if from_ms < 0 else ', or neurons fired directly by the pulse'} "
-            f"({100 * spikes / max(len(recording.spike_times_s), 1):.1f} % of all); {remedy}"
+            f"({100 * every_pulse / len(recording.spike_times_s):.1f} % of all); {remedy}"
         )
         yield Finding("artefact-spikes", "warning" if reaches else "note", message, spikes / n_stimuli)
     if quiet_s > 0 and spontaneous > 0:
