@@ -19,7 +19,7 @@ from animat.recordings.formats.csv import read_csv
 from animat.recordings.formats.hdf5 import DAMAGE
 from animat.recordings.formats.npz import read_npz
 from animat.recordings.formats.response_files import read_response_npz, read_response_table
-from animat.recordings.formats.text_table import GZIP, read_text_table
+from animat.recordings.formats.text_table import GZIP, read_table
 from animat.recordings.hdf5_subprocess import read_hdf5_in_subprocess
 from animat.recordings.recording import Recording, ResponseTable
 
@@ -126,7 +126,7 @@ def _read_text(path: Path, begin: bytes, stimuli_path: str | os.PathLike[str] | 
         kind = known or "an unknown kind of file"
         raise InvalidFile(f"{path}: expected a recording (NWB, MaxWell, CL1, NPZ or CSV), got {kind}")
     try:
-        table = read_text_table(path)
+        table = read_table(path)
         return read_response_table(table) or read_csv(table, stimuli_path)
     except InvalidFile as error:
         if not has_hdf5_name or stimuli_path is not None:

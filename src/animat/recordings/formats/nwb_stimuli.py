@@ -13,7 +13,7 @@ from animat.errors import InvalidFile, some_of
 from animat.recordings.columns import Column
 from animat.recordings.findings import Finding, left_out_findings
 from animat.recordings.formats.hdf5 import Hdf5File, choose, is_positive
-from animat.recordings.formats.nwb_layout import ELECTRODES_TABLE
+from animat.recordings.formats.nwb_layout import ELECTRODES
 from animat.recordings.formats.text_table import whole_numbers
 from animat.tables import UNKNOWN, padded
 
@@ -155,11 +155,11 @@ def _electrodes(file: Hdf5File, at: str, n: int) -> Column | None:
 
 def _electrodes_in_rows(file: Hdf5File, at: str, rows: Column) -> Column | None:
     """The electrodes in rows of the electrodes table that a column refers to; None for those of another table."""
-    table, column = file.node(ELECTRODES_TABLE), file.dataset(at)
+    table, column = file.node(ELECTRODES), file.dataset(at)
     to = column.attrs.get("table")
     if not isinstance(to, h5py.Reference) or not to or table is None or file.file[to] != table:
         return None
-    numbers = file.read(f"{ELECTRODES_TABLE}/id").astype(np.int64).reshape(-1)
+    numbers = file.read(f"{ELECTRODES}/id").astype(np.int64).reshape(-1)
     if np.any((rows < 0) | (rows >= len(numbers))):
         return None
     return numbers[rows]

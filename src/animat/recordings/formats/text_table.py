@@ -97,7 +97,7 @@ class TextTable:
             self.findings.append(Finding(name, "note", message))
 
 
-def read_text_table(path: Path, bare: str | None = None) -> TextTable:
+def read_table(path: Path, bare: str | None = None) -> TextTable:
     """Read a text table in UTF-8, gzipped or not, with as many fields in each row as in the header.
 
     A file without a header may be a single column, whose name is `bare`.
