@@ -218,9 +218,7 @@ def _separate_clocks(recording: Recording) -> str | None:
     )
 
 
-def late_start(
-    spike_time_s: Float64[np.ndarray, " spikes"], stimulus_time_s: Float64[np.ndarray, " stimuli"]
-) -> Iterator[Finding]:
+def late_start(spike_time_s: np.ndarray, stimulus_time_s: np.ndarray) -> Iterator[Finding]:
     """A finding if a recording with an unknown start, assumed to be 0, has its first event much later."""
     event_s = np.sort(np.concatenate([spike_time_s, stimulus_time_s]))
     if len(spike_time_s) < LATE_SPIKES:

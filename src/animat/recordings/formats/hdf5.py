@@ -226,12 +226,10 @@ def choose(
 
     `what` is chosen and where (`rig.h5: part`), by an `option` (`--part`) of some `commands`.
     """
-    candidates = list(names)
-    if asked in candidates or (asked is None and len(candidates) == 1):
-        return asked or candidates[0]
-    listed = some_of([describe(name)[:80] for name in candidates])
+    found = list(names)
+    if asked in found or (asked is None and len(found) == 1):
+        return asked or found[0]
+    listed = some_of([describe(name)[:80] for name in found])
     if asked is not None:
         raise InvalidFile(f"{what}: expected one of {listed}; got {asked}")
-    raise InvalidFile(
-        f"{what}: expected one, found {len(candidates)}: {listed}; choose with {option} NAME in {commands}"
-    )
+    raise InvalidFile(f"{what}: expected one, found {len(found)}: {listed}; choose with {option} NAME in {commands}")

@@ -176,9 +176,7 @@ def _events(file: Hdf5File, layout: _Layout, stimuli: str | None) -> tuple[Colum
     if "eventtype" in names and len(frame):
         types = file.read(at, "eventtype")
         counts = {str(t): int(np.count_nonzero(types == t)) for t in np.unique(types)}
-        which = choose(
-            f"{file.path}: stimuli", "--stimuli", counts, stimuli, lambda name: f"{name} ({counts[name]:,} events)"
-        )
+        which = choose(f"{file.path}: stimuli", "--stimuli", counts, stimuli, lambda t: f"{t} ({counts[t]:,} events)")
         is_stimulus = types.astype(np.str_) == which
         if left := int(np.count_nonzero(~is_stimulus)):
             message = f"{left:,} events of other types than {which} are left out"
