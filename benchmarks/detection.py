@@ -22,7 +22,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from functools import partial
 from pathlib import Path
 
 import h5py
@@ -61,15 +60,18 @@ def write_traces(path: Path, channels: int, seconds: float) -> None:
 def measure(engine: str, path: Path, stimuli_hz: float) -> dict[str, float]:
     """One row, in this process."""
     from animat.recordings.detection.spikes import detect_spikes
-    from animat.recordings.formats.traces import read_dataset_uv
-    from animat.recordings.raw import RawTraces
+    from animat.recordings.raw import RawTraces, in_microvolts
     from animat.recordings.recording import Channels
 
     with h5py.File(path, "r") as file:
         samples, n = file["raw"].shape
         truth = set(zip(file["truth/sample"][:].tolist(), file["truth/channel"][:].tolist(), strict=True))
     table = Channels(np.arange(n).astype(str), np.arange(n), np.arange(n) % 220 * 17.5, np.arange(n) // 220 * 17.5)
-    read_uv = partial(read_dataset_uv, path, "raw", np.arange(n), False, STEP_UV)
+
+    def read_uv(start: int, stop: int) -> np.ndarray:
+        with h5py.File(path, "r") as again:
+            return in_microvolts(again["raw"][start:stop], STEP_UV)
+
     traces = RawTraces(read_uv, table, samples, RATE_HZ)
     if engine == "spikeinterface":
         import spikeinterface.sortingcomponents.peak_detection  # noqa: F401
