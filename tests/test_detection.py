@@ -24,7 +24,7 @@ from animat.recordings.detection.spikes import (
     find_negative_peaks,
     median_noise_uv,
 )
-from animat.recordings.formats.traces import open_traces
+from animat.recordings.formats.hdf5_formats import open_traces
 from animat.recordings.raw import RawTraces, in_microvolts
 from animat.recordings.recording import Channels
 from animat.stimulation.pulse import PUBLISHED_PULSE
