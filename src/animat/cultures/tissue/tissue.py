@@ -95,10 +95,7 @@ class Tissue:
         12.5 ms is the same as in one. A pulse acts at the first step that does not begin before it.
 
         Args:
-            pulses: with times in [now_s, now_s + duration_s), in any order.
-
-        Raises:
-            InvalidArgument: for a negative duration, or a pulse outside this stretch of time; no time has then passed.
+            pulses: with times in [now_s, now_s + duration_s), in any order; for any other no time passes.
         """
         end_ns = self._now_ns + _nanoseconds(duration_s)
         if pulses:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -55,14 +54,12 @@ def read_hdf5(path: Path, *, part: str | None = None, stimuli: str | None = None
         return read_maxwell(file, part, stimuli) if kind == "MaxWell" else read_cl1(file)
 
 
-def open_traces(
-    path: str | os.PathLike[str], *, part: str | None = None, stimuli: str | None = None
-) -> tuple[RawTraces, Recording]:
+def open_traces(path: Path, *, part: str | None = None, stimuli: str | None = None) -> tuple[RawTraces, Recording]:
     """The raw traces of a file, and its recording without spikes: channels, stimuli, provenance.
 
     `part` says which recording of a MaxWell file, or which series of an NWB file, `stimuli` as in `read_recording`.
     """
-    with hdf5_file(Path(path)) as file:
+    with hdf5_file(path) as file:
         kind = _format_of(file)
         if kind == "MaxWell":
             base = read_maxwell(file, part, stimuli, spikes=False)
