@@ -20,9 +20,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from animat.execution.cluster import Cluster
+from animat.execution.cluster import Cluster, local_cluster
 from animat.execution.jobs import Job, Jobs
-from animat.execution.local_cluster import local_cluster
 from animat.execution.receipts import Receipt, receipt_path
 from animat.execution.task import Task, TaskResult, carry_out_alone
 from animat.execution.training import train

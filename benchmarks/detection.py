@@ -69,8 +69,8 @@ def measure(engine: str, path: Path, stimuli_hz: float) -> dict[str, float]:
     table = Channels(np.arange(n).astype(str), np.arange(n), np.arange(n) % 220 * 17.5, np.arange(n) // 220 * 17.5)
 
     def read_uv(start: int, stop: int) -> np.ndarray:
-        with h5py.File(path, "r") as again:
-            return in_microvolts(again["raw"][start:stop], STEP_UV)
+        with h5py.File(path, "r") as file:
+            return in_microvolts(file["raw"][start:stop], STEP_UV)
 
     traces = RawTraces(read_uv, table, samples, RATE_HZ)
     if engine == "spikeinterface":

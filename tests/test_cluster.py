@@ -21,10 +21,9 @@ import pytest
 
 from animat.cli import _parse, main
 from animat.errors import AnimatError, InvalidFile, Mismatch
-from animat.execution.cluster import Cluster
+from animat.execution.cluster import Cluster, local_cluster
 from animat.execution.dask_worker import _own_cores, versions_tag
 from animat.execution.jobs import PLANNED, Job, Jobs
-from animat.execution.local_cluster import local_cluster
 from animat.execution.task import Task, bring_back, carry_out_unshared, store
 from animat.progress import Progress, Silent
 from worker_tasks import Fail, Join, Sized, describe_process, rest
@@ -113,7 +112,7 @@ def test_a_scheduler_s_file_may_be_in_a_new_folder_and_is_no_folder(
         made.append(file.parent.is_dir())
         raise AnimatError("stopped")
 
-    monkeypatch.setattr("animat.execution.local_cluster._start", start)
+    monkeypatch.setattr("animat.execution.cluster._start", start)
     for file, said in (
         (tmp_path / "new" / "cluster.json", "stopped"),
         (tmp_path, f"{tmp_path}: expected no file, got a folder"),
@@ -474,7 +473,7 @@ def test_without_a_cluster_every_folder_is_shared(tmp_path: Path, capsys: pytest
 def test_a_cluster_ends_where_its_scheduler_died_as_its_workers_began(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("animat.execution.local_cluster._PATIENCE_S", 2)
+    monkeypatch.setattr("animat.execution.cluster._PATIENCE_S", 2)
     with local_cluster(1, tmp_path / "cluster.json") as (scheduler, looks_after):
         scheduler.kill()
         time.sleep(2)

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 
+from animat.execution.cluster import local_cluster
 from animat.execution.dispatch import ATTEMPTS
-from animat.execution.local_cluster import local_cluster
 
 distributed = pytest.importorskip("distributed", reason="distributed, of the extra [cluster], is not installed")
 pytestmark = pytest.mark.long

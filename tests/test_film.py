@@ -16,8 +16,7 @@ from animat.cli import main
 from animat.closed_loop.agents import Agent, AnyCondition, OneCondition
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.running import run_session
-from animat.closed_loop.session import read_session
-from animat.closed_loop.session_data import LOG_FILE
+from animat.closed_loop.session import LOG_FILE, read_session
 from animat.coding.mapping import Thresholds
 from animat.errors import InvalidArgument
 from animat.neurons.timeline import fit_timeline

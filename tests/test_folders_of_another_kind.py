@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from animat.cli import main
-from animat.closed_loop.session_data import LOG_FILE as SESSION
+from animat.closed_loop.session import LOG_FILE as SESSION
 from animat.cultures.series import SELECTION_FILE, STATE_FILE
 from animat.errors import Mismatch
 from animat.folders import MARKERS, Kind, expect_no_other

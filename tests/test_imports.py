@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import importlib
 import subprocess
 import sys
 from functools import cache
@@ -104,6 +105,18 @@ def modules_after(statement: str) -> set[str]:
     code = f"import sys; {statement}; print(*sorted({{name.split('.')[0] for name in sys.modules}}))"
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     return set(ran.stdout.splitlines()[-1].split())
+
+
+BENCHMARKS = sorted((PACKAGE.parents[1] / "benchmarks").glob("*.py"))
+
+
+@pytest.mark.parametrize("benchmark", BENCHMARKS, ids=lambda file: file.stem)
+def test_what_a_benchmark_imports_is_there(benchmark: Path) -> None:
+    for node in ast.walk(ast.parse(benchmark.read_text())):
+        if isinstance(node, ast.ImportFrom) and node.module is not None and node.module.startswith("animat"):
+            module = importlib.import_module(node.module)
+            missing = [each.name for each in node.names if not hasattr(module, each.name)]
+            assert missing == [], node.module
 
 
 HEAVY = {"jax", "jaxlib", "scipy", "matplotlib", "pynwb", "hdmf", "h5py", "numba", "pandas", "optax", "optuna"}

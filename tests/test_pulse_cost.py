@@ -17,7 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from animat.cli import main
-from animat.coding.electrode_pulses import electrode_pulses
+from animat.coding.encoder import electrode_pulses
 from animat.coding.mapping import Thresholds
 from animat.cultures.observed import Observed
 from animat.environment import Animat, Environment

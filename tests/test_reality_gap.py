@@ -39,11 +39,11 @@ from animat.neurons.simulator import NeuronSimulator, fit_empirical, pooled_perc
 from animat.neurons.synthetic import LABELS, MEANS_HZ
 from animat.neurons.timeline import Kind, fit_timeline
 from animat.reality_gap import Calibration, RealityGap, Row, check_policies, run_policies
-from animat.reality_gap.interventions import intervention_table
 from animat.reality_gap.predicting import EPISODES, ROLL_OUTS, roll_out_seed
 from animat.reality_gap.row import resampled_means
 from animat.reality_gap.running import planned_episodes
 from animat.reality_gap.session_responses import read_responses
+from animat.reality_gap.table import intervention_table
 from animat.recordings.findings import Finding, warnings_once
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.recorded_culture import RecordedCulture
@@ -234,7 +234,7 @@ def test_the_optimal_return_is_waited_for_where_the_budget_ends_the_session(
         time.sleep(0.05)
         return [12.5], None
 
-    monkeypatch.setattr("animat.reality_gap.optimum.optimal_values", slow)
+    monkeypatch.setattr("animat.reality_gap.running.optimal_values", slow)
     monkeypatch.setattr("animat.reality_gap.running.VirtualCulture", FakeCulture)
     with FakeCulture() as culture:
         of = {"p0": policy_of(0, series)}, culture, Calibration.of_series(series)
@@ -250,7 +250,7 @@ def test_a_session_on_a_simulation_is_not_lost_if_the_optimal_return_fails(
     def fail(*_: Any, **__: Any) -> Any:
         raise MemoryError("no room")
 
-    monkeypatch.setattr("animat.reality_gap.optimum.optimal_values", fail)
+    monkeypatch.setattr("animat.reality_gap.running.optimal_values", fail)
     of = {"p0": policy_of(0, series)}, FakeCulture(), Calibration.of_series(series)
     # On a device the optimal return is computed before the loop begins.
     with of[1], pytest.raises(MemoryError):

@@ -21,8 +21,7 @@ from animat.cli import main
 from animat.closed_loop.agents import Agent, OneCondition
 from animat.closed_loop.log import LogWriter, Record, read_log
 from animat.closed_loop.running import run_session
-from animat.closed_loop.session import Session, read_session, recover_session
-from animat.closed_loop.session_data import LOG_FILE
+from animat.closed_loop.session import LOG_FILE, Session, read_session, recover_session
 from animat.errors import InvalidFile, UnusableData
 from animat.recordings.formats.hdf5_formats import read_hdf5
 from animat.recordings.formats.nwb import write_nwb

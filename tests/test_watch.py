@@ -18,13 +18,11 @@ import numpy as np
 import pytest
 
 from animat.closed_loop.log import LogWriter, Record, read_log
-from animat.closed_loop.session import read_session
-from animat.closed_loop.session_data import LOG_FILE
+from animat.closed_loop.session import LOG_FILE, read_session
 from animat.closed_loop.tick import STOP_FILE
 from animat.errors import InvalidArgument, InvalidFile
 from animat.watch.session import SessionView, _in_force, stop_session
-from animat.watch.sums import by_agent
-from animat.watch.tail import Tail
+from animat.watch.tail import Tail, by_agent
 from watching import session_in
 
 

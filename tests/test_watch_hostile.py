@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 from safetensors.numpy import save
 
 from animat.closed_loop.log import read_log
-from animat.closed_loop.session_data import LOG_FILE
+from animat.closed_loop.session import LOG_FILE
 from animat.errors import AnimatError
 from animat.training.policy import CURVE
 from animat.watch.session import SessionView

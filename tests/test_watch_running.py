@@ -19,8 +19,7 @@ from typing import Any
 
 import pytest
 
-from animat.closed_loop.session import Session, read_session
-from animat.closed_loop.session_data import LOG_FILE
+from animat.closed_loop.session import LOG_FILE, Session, read_session
 from animat.closed_loop.tick import STOP_FILE
 from animat.errors import AnimatError, InvalidArgument
 from animat.watch.serving import watching

@@ -14,7 +14,7 @@ import pytest
 
 from animat.cli import COMMANDS, main
 from animat.closed_loop.log import LogWriter, read_log
-from animat.closed_loop.session_data import LOG_FILE
+from animat.closed_loop.session import LOG_FILE
 from animat.closed_loop.tick import STOP_FILE
 from animat.studies.cultures import MANIFEST as CULTURES
 from animat.studies.folder import MANIFEST as STUDY

@@ -24,10 +24,9 @@ from animat.studies.context import ContextStudy, plan_context_study
 from animat.studies.run import plan_study
 from animat.studies.toml import read_study
 from animat.training.policy import CURVE
-from animat.watch.cultures import CulturesView
 from animat.watch.discovery import is_locked
 from animat.watch.recording import RecordingView
-from animat.watch.study import StudyView
+from animat.watch.study import CulturesView, StudyView
 from animat.watch.training import TrainingView
 from animat.watch.tuning import TuningView
 from animat.writing import exclusive_lock

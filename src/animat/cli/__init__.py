@@ -41,6 +41,7 @@ from animat.ctrl_c import interruptible
 from animat.devices import stay_on_cores
 from animat.errors import AnimatError, InvalidArgument, did_you_mean, out_of_memory
 from animat.plain_file import is_folder
+from animat.records import as_json
 
 COMMANDS: dict[str, type[Command]] = {
     "record": Record,
@@ -131,8 +132,6 @@ def _run(arguments: list[str]) -> int:
             print(f"animat: {' '.join(note.split())}", file=sys.stderr)
         return 130 if isinstance(error, KeyboardInterrupt) else 1
     if command.json:
-        from animat.records import as_json
-
         print(json.dumps(as_json(results)))
     # Some of several files could not be read or used; messages have already named them.
     is_refused = any(finding["severity"] == "refuse" for finding in results.get("together", ()))

@@ -27,7 +27,7 @@ class ClusterCommand(Command):
     """Where the scheduler writes its address; removed at the end"""
 
     def run(self) -> dict[str, Any]:
-        from animat.execution.local_cluster import local_cluster
+        from animat.execution.cluster import local_cluster
 
         workers = len(own_cores()) if self.workers is None else self.workers
         expect_at_least("--workers", workers, 1)

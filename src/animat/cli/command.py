@@ -6,11 +6,11 @@ import abc
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-from animat.errors import InvalidArgument, InvalidFile, LoopEnded, did_you_mean, expect_at_least, within
+from animat.errors import InvalidArgument, InvalidFile, LoopEnded
 from animat.process import own_cores
 
 if TYPE_CHECKING:
@@ -110,10 +110,6 @@ class StimulationOptions(FolderCommand):
     patience_s: float = 10.0
     """Seconds beyond the expected time that a culture, robot or agent may take before the session ends"""
 
-    def _expect_culture_seed(self) -> None:
-        """Raise for a negative seed, under the option's name: later it would be called `seed`, as the policies' is."""
-        expect_at_least("--culture-seed", self.culture_seed, 0)
-
     def _loop_settings(self) -> dict[str, Any]:
         names = ("on_burst", "on_late", "pause_s", "warm_up", "settling", "patience_s")
         return {name: getattr(self, name) for name in names}
@@ -148,10 +144,9 @@ def read_sac(pairs: Sequence[str]) -> SAC:
     """The algorithm's settings, with `pairs` in place of its defaults; InvalidArgument for an impossible one."""
     from animat.training.settings import SAC
 
-    numbers, known = read_numbers("--sac", pairs), [field.name for field in fields(SAC)]
-    for name in numbers:
-        if name not in known:
-            near = did_you_mean(name, known)
-            raise InvalidArgument(f"--sac: {name}: no such setting; expected some of {', '.join(known)}{near}")
-    with within("--sac"):
+    numbers = read_numbers("--sac", pairs)
+    try:
         return SAC(**numbers)  # type: ignore[arg-type]
+    except InvalidArgument as error:
+        # An option has no tables, of which a setting could be at the top.
+        raise InvalidArgument(f"--sac: {str(error).replace(' at the top', '')}") from error

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from tyro.conf import Positional
 
 from animat.cli.command import StimulationOptions, expect_no_fault, read_sac
-from animat.errors import InvalidArgument
+from animat.errors import InvalidArgument, expect_at_least
 from animat.writing import exclusive_lock
 
 if TYPE_CHECKING:
@@ -87,7 +87,8 @@ class Live(StimulationOptions):
                 f"--recordings: expected some for a replay and none for others, got {len(self.recordings)} for "
                 f"{self.culture}: a live run records the culture itself"
             )
-        self._expect_culture_seed()
+        # Later it would be called `seed`, as the policies' is.
+        expect_at_least("--culture-seed", self.culture_seed, 0)
         speed = (30.0 if simulated else 1.0) if self.speed is None else self.speed
         timetable = Timetable(self.interval_min, self.duration_min, speed)
         robot = robot_named(self.robot)

@@ -120,9 +120,7 @@ def simulator_settings(
     defaults = {"kind": None, "bins": 20, "range_hz": None}
     requested = {"kind": kind, "bins": bins, "range_hz": range_hz}
     sources = (requested,) if kind is not None else (trained, requested)
-    settings = defaults | {
-        name: source[name] for source in sources for name in defaults if source.get(name) is not None
-    }
+    settings = defaults | {name: each[name] for each in sources for name in defaults if each.get(name) is not None}
     for option, value in (("--bins", bins), ("--range-hz", range_hz)):
         if value is None:
             continue

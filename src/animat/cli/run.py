@@ -145,7 +145,8 @@ class Run(StimulationOptions):
 
         check_episodes("--episodes", self.episodes)
         expect_at_least("--seed", self.seed, 0)
-        self._expect_culture_seed()
+        # Later it would be called `seed`, as the policies' is.
+        expect_at_least("--culture-seed", self.culture_seed, 0)
         policies = policies_for(self.robot, self.mapping, self.policies)
         first = check_policies(policies)
         if not self.recordings:
@@ -184,9 +185,7 @@ class Run(StimulationOptions):
             print(f"recording: {gap.session.recording_file}; every tick: {self.out / 'session.log'}")
         expect_no_fault(gap.session, self.out)
 
-    def _protocol(
-        self, recordings: Sequence[Recording], calibrating: Recording
-    ) -> tuple[Protocol, tuple[Finding, ...]]:
+    def _protocol(self, recordings: Sequence[Recording], calibrating: Recording) -> tuple[Protocol, list[Finding]]:
         """The protocol with the pulse and number of patterns, and a warning if the recordings do not state them.
 
         It is that of the calibrating recording, else of --protocol, else the usual one.
@@ -208,14 +207,14 @@ class Run(StimulationOptions):
         if (protocol := calibrating.protocol or option) is not None:
             # A replay responds alike to every pulse, and its limits are those of voltages.
             is_delivered = self.culture != "replay" or protocol.pulse.kind == usual.pulse.kind
-            return (protocol if is_delivered else replace(protocol, pulse=usual.pulse)), ()
+            return (protocol if is_delivered else replace(protocol, pulse=usual.pulse)), []
         pulse = next(iter(pulses), usual.pulse)
         source = "as in the other recordings" if pulses else f"the usual one on a {self.culture}"
         message = (
             f"the recording at {in_min(calibrating.start_min)}, which calibrates the loop, does not state its pulse: "
             f"the loop delivers {pulse}, {source}; to change it, use --protocol"
         )
-        return replace(usual, pulse=pulse), (Finding("unknown-pulse", "warning", message),)
+        return replace(usual, pulse=pulse), [Finding("unknown-pulse", "warning", message)]
 
     def _culture(
         self, recordings: Sequence[Recording], calibrating: Recording, pulse: Pulse, progress: Progress

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any
 from tyro.conf import Positional
 
 from animat.cli.command import JobOptions
+from animat.columns import align_columns
+from animat.errors import AnimatError, counted
 
 if TYPE_CHECKING:
     from animat.studies.specification import Study
@@ -38,7 +40,6 @@ def run_and_report(study: Study, base: Path, command: JobOptions) -> dict[str, A
 
 
 def _run_one(study: Study, base: Path, command: JobOptions) -> dict[str, Any]:
-    from animat.columns import align_columns
     from animat.report.results import Results
     from animat.studies.folder import RESULTS
     from animat.studies.outperforming import not_outperforming
@@ -73,8 +74,6 @@ def _run_one(study: Study, base: Path, command: JobOptions) -> dict[str, Any]:
 
 
 def _run_many(study: Study, base: Path, command: JobOptions) -> dict[str, Any]:
-    from animat.columns import align_columns
-    from animat.errors import AnimatError, counted
     from animat.studies.cultures import run_over_cultures, write_cultures_page
     from animat.studies.results import MISSING
 

@@ -39,9 +39,8 @@ class AdaptiveThresholds:
     becomes this when all responses rise equally, on a scale on which they are normal, so that their mean rank is
     1/2 + d. With d = 0.05 the median is at P57, with d = -0.05 at P43.
 
-    Args:
-        recorded: responses of the recording from which thresholds start. If a condition has more than `NEWEST`, the
-            newest are used, and the same share for all conditions.
+    Thresholds start from the `recorded` responses. If a condition has more than `NEWEST`, the newest are used, and the
+    same share for all conditions.
     """
 
     def __init__(self, recorded: AdjustedRanks) -> None:

@@ -9,7 +9,7 @@ from typing import Any, Protocol, get_args
 
 import jax
 import numpy as np
-from jaxtyping import Array, Float, Float32, Float64
+from jaxtyping import Array, Float, Float64
 
 from animat.environment import Animat, Environment
 from animat.errors import InvalidArgument, shown
@@ -75,12 +75,7 @@ class ActorController:
 
 
 @partial(jax.jit, static_argnums=0)
-def _decided(
-    environment: Environment[Any],
-    actor: Actor,
-    observation: Float32[Array, " observations"],
-    uniforms: Float32[Array, " drawn"],
-) -> Array:
+def _decided(environment: Environment[Any], actor: Actor, observation: Array, uniforms: Array) -> Array:
     return actor.act(environment, (observation / environment.scales)[None], uniforms[None])[0]
 
 
@@ -90,7 +85,6 @@ class Agent:
 
     Attributes:
         name: unique in its session.
-        meaning: a short description.
         controller: chooses the conditions; several, by name, take turns, one episode each: a control then represents
             all policies, not one of them.
         delivery: as for a control (`animat.evaluation.controls.Control`). `"silent"`: spontaneous activity is read in

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import operator
 import time
 from collections import Counter, deque
@@ -18,8 +19,15 @@ from animat.closed_loop.agents import Agent, Controller
 from animat.closed_loop.log import Record
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.runner import runner_of
-from animat.closed_loop.stopping import Stop, ending_of
-from animat.closed_loop.stretch import Request, Stretch, check_answer, read_response, stretch_record
+from animat.closed_loop.stretch import (
+    Stop,
+    Stretch,
+    check_answer,
+    ending_of,
+    read_response,
+    request_fields,
+    stretch_record,
+)
 from animat.closed_loop.tick import EndedBy, Ending, Handled, Tick
 from animat.closed_loop.timing import Clock
 from animat.coding.encoder import Dealer
@@ -41,11 +49,10 @@ class Driver:
 
     Attributes:
         turns: the agent of each episode, by its number.
-        account: of the stimulation budget.
         stop_file: checked before every request to the culture; once it exists, there are no more requests.
         is_stopped: set by another thread, after which there are no more requests either.
         deadline: latest time on `time.monotonic()` for an answer, and from whom; a supervisor watches it.
-        request: the latest request to the culture, answered or not; a supervisor logs it.
+        request: the fields of the latest request to the culture, answered or not; a supervisor logs it.
         unfinished: the record of a response that has not moved the robot yet: to be logged if it never does.
     """
 
@@ -59,7 +66,7 @@ class Driver:
     stop_file: Path
     is_stopped: bool = False
     deadline: tuple[float, str] = float("inf"), "nobody"
-    request: Request | None = None
+    request: dict[str, Any] | None = None
     unfinished: Record | None = None
 
     def __post_init__(self) -> None:
@@ -121,7 +128,11 @@ class Driver:
         for rounds in loop.rounds_before(episode, is_silent=agent.delivery == "silent"):
             self._warm_up(agent, episode, rounds)
         remembering = loop.remembering if agent.sees_neurons(turn) else None
-        source, conditions = self._source_of(agent), list[int]()
+        source, conditions = list[int](), list[int]()
+        if agent.delivery == "yoked":
+            assert isinstance(agent.controller, Mapping)
+            # The stimuli of its controllers' newest episode are repeated.
+            source = [of for name, of in self._last_delivered.items() if name in agent.controller][-1]
         for iteration in range(loop.robot.episode_limit):
             seen = observation
             if remembering is not None:
@@ -131,12 +142,10 @@ class Driver:
                 delivered = int(self._rng.integers(len(loop.conditions)))
             elif agent.delivery == "yoked":
                 delivered = source[iteration % len(source)]
-            repeats = 0
-            while True:
+            for repeats in itertools.count():
                 tick, again = self._present(agent, episode, iteration, chosen, delivered, repeats)
                 if not again:
                     break
-                repeats += 1
             conditions.append(delivered)
             if tick.terminated or tick.truncated:
                 break
@@ -144,14 +153,6 @@ class Driver:
         # Insert it again, as the newest.
         self._last_delivered.pop(agent.name, None)
         self._last_delivered[agent.name] = conditions
-
-    def _source_of(self, agent: Agent) -> list[int]:
-        """The conditions that a yoked agent repeats: those of its controllers' newest episode."""
-        if agent.delivery != "yoked":
-            return []
-        assert isinstance(agent.controller, Mapping)
-        sources = [conditions for name, conditions in self._last_delivered.items() if name in agent.controller]
-        return sources[-1]
 
     def _start(self, episode: int, turn: int) -> Float64[np.ndarray, " observations"]:
         """Start the robot: all agents of a round have the same start."""
@@ -170,11 +171,9 @@ class Driver:
             for condition in self._rng.permutation(len(self.loop.conditions)).tolist():
                 self._present(agent, episode, -1, condition, condition, 0)
 
-    def _choose(self, agent: Agent, controller: Controller, observation: Float64[np.ndarray, " observations"]) -> int:
+    def _choose(self, agent: Agent, controller: Controller, seen: Float64[np.ndarray, " observed"]) -> int:
         n = len(self.loop.conditions)
-        chosen = self._answer_of(
-            agent.name, "controller", lambda: operator.index(controller.act(observation, self._rng))
-        )
+        chosen = self._answer_of(agent.name, "controller", lambda: operator.index(controller.act(seen, self._rng)))
         if not 0 <= chosen < n:
             raise Stop(Ending("controller", f"{agent.name} chose {chosen}: expected a condition from 0 to {n - 1}"))
         return chosen
@@ -309,7 +308,8 @@ class Driver:
             account.check(stimuli)
         except BudgetSpent as spent:
             raise Stop(Ending("budget", str(spent))) from spent
-        request = Request(self._n_stretches, since_s - self._zero_s, tuple(stimuli))
+        number = self._n_stretches
+        request = request_fields(number, since_s - self._zero_s, stimuli)
         self._n_stretches += 1
         # Spent before the answer: unanswered pulses may have been delivered.
         account.spend(stimuli)
@@ -341,7 +341,7 @@ class Driver:
             raise Stop(ending)
         offset_s = observed.start_s - self._zero_s
         stretch = Stretch(
-            request.stretch,
+            number,
             offset_s,
             observed.duration_s,
             self._on_samples(offset_s + observed.spikes.time_s),
@@ -359,9 +359,9 @@ class Driver:
         self._data_at_s = self.clock.now_s()
         return stretch
 
-    def _log_fault(self, ending: Ending, request: Request, **more: Any) -> None:
+    def _log_fault(self, ending: Ending, request: dict[str, Any], **more: Any) -> None:
         """Log a request that has no usable answer."""
-        fields = {"kind": "event", "what": ending.by, "message": ending.message, **request.to_dict(), **more}
+        fields = {"kind": "event", "what": ending.by, "message": ending.message, **request, **more}
         self.records.append(Record(fields))
 
     def _answer_of(self, who: str, by: EndedBy, ask: Callable[[], T]) -> T:

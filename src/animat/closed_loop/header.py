@@ -79,7 +79,6 @@ class Header:
         sampling_rate_hz: of the culture; NaN: unknown.
         start_min: start of the session on the culture's clock.
         recorded_at: when it began, ISO 8601.
-        conditions: their labels.
         observed: the columns of the robot's observation, with their units.
         loop: all settings, as JSON.
         readouts: names of the groups of channels that were read; none where all channels were read as one.
@@ -104,11 +103,7 @@ def observed_columns(robot: Robot[Any]) -> list[str]:
 
 
 def read_header(file: Path, fields: Mapping[str, Any]) -> Header:
-    """The header of a session's log, from the fields of its first record.
-
-    Raises:
-        InvalidFile: naming a field that is missing or invalid.
-    """
+    """The header of a log, from its first record's fields; InvalidFile names one that is missing or invalid."""
     if fields.get("format") != FORMAT:
         raise InvalidFile(f"{file}: expected {FORMAT!r}, got {shown(fields.get('format'))}")
     try:

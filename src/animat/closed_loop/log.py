@@ -52,8 +52,7 @@ class Record(NamedTuple):
 class LogWriter:
     """Appends records to a new file; the operating system has each when `append` returns: a kill loses none.
 
-    Raises:
-        InvalidFile: if the file exists, or cannot be written.
+    Raises InvalidFile if the file exists, or cannot be written.
     """
 
     def __init__(self, path: Path, header: Mapping[str, Any]) -> None:
@@ -88,7 +87,6 @@ class LogWriter:
         os.fsync(self._file)
 
     def close(self) -> None:
-        """Close the file."""
         os.close(self._file)
 
     def _write(self, data: bytes) -> None:
@@ -158,8 +156,7 @@ class Log:
 def read_log(path: str | os.PathLike[str]) -> Log:
     """Read a log, even if its program was killed: every checksum is checked now, and the contents are read later.
 
-    Raises:
-        InvalidFile: if it is missing, not a log, or has no intact first record.
+    Raises InvalidFile if it is missing, not a log, or has no intact first record.
     """
     path = expect_plain_file(path)
     with open_file(path) as file:

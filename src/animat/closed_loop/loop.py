@@ -47,17 +47,12 @@ class Loop:
     order; the response to the last one is read.
 
     Attributes:
-        robot: that is driven.
-        mapping: from a response to a command.
         conditions: to choose from; each states its stimuli (`animat.responses.condition.Condition`).
         percentiles: of the simulator that the policy was trained on, in Hz, shape (11,), or (readouts, 11) for several
             readouts.
         adaptive_from: responses of that recording, from which adaptive thresholds start (see
             `animat.closed_loop.adaptive`). None: thresholds are fixed.
-        pulses: of a trial.
-        window_ms: the response window.
         burst_threshold: ratio of active channels above which a response is a burst; 1: no response is.
-        pulse: delivered by each electrode.
         patterns: how many of the culture's patterns are used, the first ones; None: all.
         on_burst: `"use"` the response as any other; `"repeat"` the stimulus, at most `most_repeats` times; `"skip"`
             it, and move the robot by the previous command (0 if there was none).

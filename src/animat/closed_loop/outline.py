@@ -16,7 +16,6 @@ class Episode:
     Attributes:
         start: the observation before the first step; empty in older logs, which do not have it.
         total: the sum of rewards, in the task's own units.
-        iterations: of the robot.
         terminated: whether it ended by itself and not at the limit.
         is_whole: whether it was completed; an episode that the session cut short has no return.
         pulses: that the culture received.
@@ -46,7 +45,6 @@ class Outline:
     Attributes:
         left_out: what the culture's device reported and the session lacks, by kind; known at the end.
         late: ticks whose pulses came late.
-        latest_s: the largest lateness.
         moved_at_s: when a robot first moved, on the clock of `wall_s`; None before.
         answered: the last stretch of time that the culture answered; -1 before.
         moving: the last episode in which a robot moved; None before.
@@ -82,8 +80,8 @@ class Outline:
         """Number of pulses that were requested and never answered."""
         return sum(map(_count_pulses, self.unanswered))
 
-    def add(self, fields: Mapping[str, Any]) -> None:
-        """Count one record."""
+    def add(self, fields: Mapping[str, Any]) -> Episode | None:
+        """Count one record; returns the episode of its tick, if it has one."""
         kind, stretch = fields["kind"], fields.get("stretch")
         if kind == "seen":
             # Older logs do not number their stretches.
@@ -91,7 +89,7 @@ class Outline:
                 self._pending.pop(stretch, None)
                 self.answered = max(self.answered, stretch)
             if fields["tick"]:
-                self._add_tick(fields["tick"], count_electrode_pulses(fields))
+                return self._add_tick(fields["tick"], count_electrode_pulses(fields))
         elif kind in ("asked", "event"):
             # Another thread writes the request: its record may follow that of its answer, or that of the event that
             # ended it, which has more fields.
@@ -101,8 +99,9 @@ class Outline:
             self._starts[fields["episode"]] = tuple(fields["observation"])
         elif kind == "end":
             self.left_out = fields.get("left_out", {})
+        return None
 
-    def _add_tick(self, tick: Mapping[str, Any], electrode_pulses: int) -> None:
+    def _add_tick(self, tick: Mapping[str, Any], electrode_pulses: int) -> Episode:
         number, n_pulses, is_late = tick["episode"], len(tick["pulse_time_s"]), tick["late_s"] > 0
         n_pulses -= list(tick["patterns"]).count(NOTHING)
         episode = self._episodes.get(number)
@@ -118,7 +117,7 @@ class Outline:
         episode.is_whole = tick["terminated"] or tick["truncated"]
         if tick["handled"] == "warm-up":
             episode.warm_up_pulses += n_pulses
-            return
+            return episode
         self.moved_at_s = tick.get("wall_s") if self.moved_at_s is None else self.moved_at_s
         self.moving = episode
         episode.electrode_pulses += electrode_pulses
@@ -130,6 +129,7 @@ class Outline:
             episode.iterations += 1
         if episode.is_whole:
             self.returns.setdefault(episode.agent, []).append(episode.total)
+        return episode
 
 
 def _count_pulses(fields: Mapping[str, Any]) -> int:

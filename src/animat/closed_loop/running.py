@@ -26,8 +26,7 @@ from animat.closed_loop.header import FORMAT, observed_columns, read_header
 from animat.closed_loop.log import LogWriter, Record
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.outline import Outline
-from animat.closed_loop.session import Session, expect_no_session
-from animat.closed_loop.session_data import LOG_FILE
+from animat.closed_loop.session import LOG_FILE, Session, expect_no_session
 from animat.closed_loop.tick import STOP_FILE, Ending
 from animat.closed_loop.timing import Clock, drop_real_time_priority, real_time_priority
 from animat.ctrl_c import KILLS, handled
@@ -78,7 +77,6 @@ def run_session(
 
     Args:
         culture: open; it stays open.
-        loop: the settings.
         agents: at least one, each name once.
         folder: for `session.log`, `session.nwb`, and `ticks.csv` with a line per tick.
         episodes: of each agent; one number, or one for each.
@@ -228,10 +226,10 @@ class _Supervisor:
                 # A pause of 0 would not yield the processor to the loop's thread on a single core.
                 time.sleep(_PAUSE_S)
         request = self._driver.request
-        if request is not None and request.stretch > self._logged_request:
+        if request is not None and request["stretch"] > self._logged_request:
             # Known even if the answer never comes, or the program is killed meanwhile.
-            self._log.append(Record({"kind": "asked", **request.to_dict()}))
-            self._logged_request = request.stretch
+            self._log.append(Record({"kind": "asked", **request}))
+            self._logged_request = request["stretch"]
         if time.monotonic() - self._synced > _SYNC_S:
             self._log.sync()
             self._synced = time.monotonic()
@@ -269,18 +267,19 @@ class _Supervisor:
     def _halt(self, ending: Ending) -> None:
         """Stop the culture in a separate thread: a backend that hangs must not block the end as well."""
         self._not_halted = f"the culture did not confirm within {_GRACE_S:g} s that it is stopped"
-        halting = threading.Thread(target=self._halt_now, args=(ending.message,), daemon=True)
+
+        def halt() -> None:
+            # From here on the guard refuses every stimulus, whatever the backend does with those already requested.
+            try:
+                self._culture.stop(ending.message)
+            except Exception as error:
+                self._not_halted = f"the culture could not be stopped ({describe_error(error)})"
+            else:
+                self._not_halted = None
+
+        halting = threading.Thread(target=halt, daemon=True)
         halting.start()
         halting.join(_GRACE_S)
-
-    def _halt_now(self, reason: str) -> None:
-        # From here on the guard refuses every stimulus, whatever the backend does with those already requested.
-        try:
-            self._culture.stop(reason)
-        except Exception as error:
-            self._not_halted = f"the culture could not be stopped ({describe_error(error)})"
-        else:
-            self._not_halted = None
 
 
 def _header(driver: Driver, predicted: Mapping[str, Interval]) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""A stretch of time of a closed loop: the request to the culture, the check of its answer, and the response."""
+"""A stretch of time of a closed loop: the request, the check of its answer, the response, or an early ending."""
 
 from __future__ import annotations
 
@@ -12,8 +12,11 @@ from jaxtyping import Bool, Float64, Int64
 
 from animat.closed_loop.log import Record
 from animat.closed_loop.loop import Loop
+from animat.closed_loop.tick import Ending
+from animat.cultures.base import Culture
 from animat.cultures.failures import describe_error
 from animat.cultures.observed import Observed
+from animat.errors import UnsafeStimulus
 from animat.recordings.recording import Channels
 from animat.responses.windows import read_windows
 from animat.stimulation.stimulus import Stimulus
@@ -22,32 +25,17 @@ _MOST_CUT_S = 0.001
 """By how much a response window may be cut: a device may report a pulse a few samples after it was due."""
 
 
-@dataclass(frozen=True, eq=False)
-class Request:
-    """A request to the culture for a stretch of time, numbered from 0; it is logged even if no answer comes.
+class Stop(Exception):
+    """The session ends before its plan is completed."""
 
-    Attributes:
-        at_s: time of the request, on the session's clock.
-        stimuli: their times count from `at_s`.
-    """
-
-    stretch: int
-    at_s: float
-    stimuli: tuple[Stimulus, ...]
-
-    def to_dict(self) -> dict[str, Any]:
-        """The fields of its record."""
-        return {
-            "stretch": self.stretch,
-            "asked_at_s": self.at_s,
-            "asked_for_s": [stimulus.time_s for stimulus in self.stimuli],
-            "stimuli": rows_of(self.stimuli),
-        }
+    def __init__(self, ending: Ending) -> None:
+        super().__init__(ending.message)
+        self.ending = ending
 
 
 @dataclass(frozen=True, eq=False)
 class Stretch:
-    """What was observed in a stretch of time; times are on the session's clock, rounded to the culture's samples."""
+    """What was observed in a stretch of time, numbered from 0; times are on the session's clock, rounded to samples."""
 
     number: int
     start_s: float
@@ -58,7 +46,13 @@ class Stretch:
     stimulus_time_s: Float64[np.ndarray, " stimuli"]
 
 
-def rows_of(stimuli: Sequence[Stimulus]) -> list[list[Any]]:
+def request_fields(number: int, at_s: float, stimuli: Sequence[Stimulus]) -> dict[str, Any]:
+    """The fields of a request for a stretch of time, logged even if no answer comes; its times count from `at_s`."""
+    times_s = [stimulus.time_s for stimulus in stimuli]
+    return {"stretch": number, "asked_at_s": at_s, "asked_for_s": times_s, "stimuli": _rows_of(stimuli)}
+
+
+def _rows_of(stimuli: Sequence[Stimulus]) -> list[list[Any]]:
     """Stimuli as rows of plain data; their times are in the tick."""
     return [[s.frequency_hz, s.pattern, s.presentation, list(s.electrodes)] for s in stimuli]
 
@@ -66,7 +60,7 @@ def rows_of(stimuli: Sequence[Stimulus]) -> list[list[Any]]:
 def stretch_record(stretch: Stretch, stimuli: Sequence[Stimulus], tick: dict[str, Any] | None) -> Record:
     """The log record of a stretch of time."""
     span = {"stretch": stretch.number, "start_s": stretch.start_s, "duration_s": stretch.duration_s}
-    fields = {"kind": "seen", **span, "stimuli": rows_of(stimuli), "tick": tick}
+    fields = {"kind": "seen", **span, "stimuli": _rows_of(stimuli), "tick": tick}
     return Record(fields, stretch.spike_times_s, stretch.spike_channels)
 
 
@@ -121,6 +115,25 @@ def check_answer(
     except Exception as error:
         return f"the culture returned something that cannot be read: {describe_error(error)}"
     return None
+
+
+def ending_of(error: Exception, culture: Culture, is_stopped: bool) -> Ending:
+    """The ending for an error of the culture; `is_stopped`: whether a person had stopped it before."""
+    if is_stopped:
+        return Ending("person", "stopped by a person")
+    if isinstance(error, UnsafeStimulus) and error.limit in ("stimuli_per_session", "net_charge_per_session"):
+        return Ending("budget", str(error))
+    if isinstance(error, UnsafeStimulus) and culture.is_stopped:
+        return Ending("culture", f"the culture was stopped: {error}")
+    lost = "the connection to the culture is lost: " if _is_lost(error) else "the culture raised "
+    return Ending("culture", lost + describe_error(error))
+
+
+def _is_lost(error: BaseException | None) -> bool:
+    """Whether an error comes from a lost connection; a timeout does not, as the device is still there."""
+    if error is None:
+        return False
+    return (isinstance(error, OSError) and not isinstance(error, TimeoutError)) or _is_lost(error.__cause__)
 
 
 def read_response(

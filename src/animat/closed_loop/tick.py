@@ -25,7 +25,6 @@ class Tick:
             and the warm-up has -1.
         chosen: the condition that was chosen, by the agent or, in a warm-up, at random.
         delivered: the condition that the culture received; of a silent agent the chosen one, without its pulses.
-        frequency_hz: of the delivered condition.
         patterns: of each pulse, -1 where its electrodes are not one of the culture's patterns; none of a silent agent.
         pulse_time_s: when each pulse really began.
         read_after_s: time of the pulse after which the response was read, or when it would have come.
@@ -85,7 +84,6 @@ class Ending:
         by: `"plan"`, all episodes were run; else what ended it early: the budget, a person (Ctrl-C), a fault of the
             culture, a missing answer (`"hang"`), a late pulse with `on_late="stop"`, the robot, the controller, the
             disk; `"crash"` where no ending was written.
-        message: what happened.
     """
 
     by: EndedBy
@@ -115,10 +113,8 @@ class TickTable:
     observation if the response did not move the robot. Flags are 0 or 1; patterns and times of several pulses are
     separated by spaces.
 
-    Each group of channels has a column of its `rate_hz` and, if there are several, of its `command`.
-
-    Args:
-        file: open for text, without translation of line ends.
+    Each group of channels has a column of its `rate_hz` and, if there are several, of its `command`. The file is open
+    for text, without translation of line ends.
     """
 
     def __init__(self, file: TextIO, header: Header) -> None:

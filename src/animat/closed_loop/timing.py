@@ -16,7 +16,6 @@ class Clock:
     """The machine's monotonic clock, in seconds from any origin; tests replace it."""
 
     def now_s(self) -> float:
-        """The time now."""
         return time.perf_counter()
 
     def sleep_until(self, time_s: float) -> None:

@@ -1,4 +1,4 @@
-"""From an action to a stimulus: each condition is delivered as in the recording."""
+"""From an action to a stimulus, delivered as in the recording, and the number of electrodes that it pulses."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Int64
 
 from animat.arguments import checked_arguments
 from animat.errors import InvalidArgument, UnusableData, shown
 from animat.responses.condition import RESTING, Condition
+from animat.stimulation.patterns import Patterns
 from animat.stimulation.stimulus import NOTHING
 from animat.tables import UNKNOWN
 
@@ -89,9 +89,7 @@ class Dealer:
     empty, so that all are used equally often, and frequencies at random.
     """
 
-    def __init__(
-        self, encoder: Encoder, patterns: Int64[np.ndarray, "patterns size"], rng: np.random.Generator
-    ) -> None:
+    def __init__(self, encoder: Encoder, patterns: Patterns, rng: np.random.Generator) -> None:
         self._encoder, self._rng = encoder, rng
         # In the order of a condition's electrodes, so that the same pattern is the same target.
         rows = (tuple(sorted(e for e in row if e != UNKNOWN)) for row in patterns.tolist())
@@ -144,3 +142,29 @@ class _Deck:
 def _fresh(targets: Sequence[Target], avoided: Sequence[Target]) -> int | None:
     """The first of the targets that is not to be avoided; None if there is none."""
     return next((i for i, each in enumerate(targets) if each not in avoided), None)
+
+
+def electrode_pulses(conditions: Sequence[Condition], pulses: int) -> tuple[float, ...] | None:
+    """The electrode pulses of a trial of each condition; None if the electrodes of all pulses are not known for some.
+
+    For a condition on one of several sets it is their mean, as they are used equally often.
+    """
+    counts = []
+    for each in conditions:
+        if not each.electrodes or (each.only_last and pulses > 1):
+            return None
+        sets = [] if each.electrodes == RESTING else each.electrodes
+        counts.append(pulses * sum(map(len, sets)) / len(each.electrodes))
+    return tuple(counts)
+
+
+def expect_electrode_pulses(conditions: Sequence[Condition], pulses: int) -> tuple[float, ...]:
+    """The same where the cost is required; raises UnusableData if they are not known."""
+    counts = electrode_pulses(conditions, pulses)
+    if counts is None:
+        raise UnusableData(
+            "pulse_cost: expected conditions that state the electrodes of all their pulses, got "
+            f"{', '.join(condition.label for condition in conditions)}; record places of several sizes, or leave the "
+            "cost out"
+        )
+    return counts

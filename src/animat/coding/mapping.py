@@ -55,11 +55,8 @@ class Thresholds(Mapping):
     There is no zero among the ten: the published end points and step leave it out. If percentiles are tied (many equal
     responses), a response on the tie passes all of them at once, and the commands in between never occur.
 
-    Args:
-        count: 1 or 9.
-
     Raises:
-        InvalidArgument: for any other count.
+        InvalidArgument: for a `count` other than 1 and 9.
 
     Source: Sawada et al. 2022, the mappings with 1 and 9 thresholds.
     """

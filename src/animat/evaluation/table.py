@@ -10,7 +10,7 @@ from typing import Any, Self
 import numpy as np
 
 from animat.arguments import checked_arguments
-from animat.coding.electrode_pulses import electrode_pulses
+from animat.coding.encoder import electrode_pulses
 from animat.columns import align_columns
 from animat.environment import Animat, Environment, Neurons, WithoutNeurons
 from animat.errors import InvalidArgument, Mismatch, UnusableData, counted, in_min

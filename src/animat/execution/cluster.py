@@ -1,4 +1,4 @@
-"""An executor on the workers of a Dask cluster (https://distributed.dask.org), with one pinned process per core."""
+"""An executor on a Dask cluster (https://distributed.dask.org), and a cluster on this machine, to try one out."""
 
 from __future__ import annotations
 
@@ -6,16 +6,19 @@ import json
 import logging
 import os
 import pickle
+import signal
 import socket
+import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Executor, Future
 from concurrent.futures import wait as wait_for
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar, final
 
-from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch, first_line
+from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch, as_invalid_file, first_line
 from animat.execution.dask_worker import VERSIONS_PREFIX, versions_tag, work
 from animat.execution.dispatch import LONGEST_S, Call, Dispatch
 from animat.execution.pinned import PinnedProcesses
@@ -26,6 +29,14 @@ from animat.process import own_cores
 P = ParamSpec("P")
 T = TypeVar("T")
 _CONNECT_S = 60
+_PATIENCE_S = 10.0
+_RUN = """
+import runpy, sys
+from animat.process import end_with_parent
+end_with_parent()
+runpy.run_module(sys.argv.pop(1), run_name="__main__", alter_sys=True)
+"""
+"""Runs a module that ends with this process; nothing runs between fork and exec, which is unsafe with JAX's threads."""
 
 
 def expect_distributed() -> Any:
@@ -177,3 +188,52 @@ def _address(where: str | os.PathLike[str]) -> str:
 
 def _format_tag(tag: str) -> str:
     return tag.replace("/", ", ").replace(":", " ")
+
+
+@contextmanager
+def local_cluster(workers: int, file: Path, *, threads: int = 1) -> Iterator[list[subprocess.Popen[bytes]]]:
+    """A scheduler and workers until the block ends; a worker that dies is replaced.
+
+    The scheduler writes its address to the file, which may not exist yet, and is removed at the end; its folder is
+    created if it is missing. Yields the processes of the scheduler and of the workers' nanny.
+    """
+    expect_distributed()
+    if file.exists():
+        got = "a folder" if file.is_dir() else "one; another cluster may be running: stop it, or remove the file"
+        raise InvalidFile(f"{file}: expected no file, got {got}")
+    with as_invalid_file(file, "cannot be written"):
+        file.parent.mkdir(parents=True, exist_ok=True)
+    with ExitStack() as stack:
+        stack.callback(file.unlink, missing_ok=True)
+        scheduler = _start("scheduler", file, "--host", "127.0.0.1", "--port", "0")
+        stack.callback(_stop, scheduler)
+        while not file.exists():
+            if scheduler.poll() is not None:
+                raise AnimatError(f"{file}: the scheduler ended before it wrote its address there; see its output")
+            time.sleep(0.1)
+        counts = ("--nworkers", str(workers), "--nthreads", str(threads))
+        nanny = _start("worker", file, *counts, "--preload", work.__module__)
+        stack.callback(_stop, nanny)
+        yield [scheduler, nanny]
+
+
+def _stop(process: subprocess.Popen[bytes]) -> None:
+    process.terminate()
+    try:
+        process.wait(_PATIENCE_S)
+    except subprocess.TimeoutExpired:
+        # Workers whose scheduler died as they started wait for it forever.
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+
+
+def _start(part: str, file: Path, *options: str) -> subprocess.Popen[bytes]:
+    quiet = {"DASK_LOGGING__DISTRIBUTED": "critical"}
+    module = f"distributed.cli.dask_{part}"
+    return subprocess.Popen(
+        [sys.executable, "-c", _RUN, module, "--no-dashboard", "--scheduler-file", file, *options],
+        # As for pinned processes: robots may be defined next to a script.
+        env={**os.environ, **quiet, "PYTHONPATH": os.pathsep.join(sys.path)},
+        # Ctrl-C reaches only this process, which then ends the others.
+        process_group=0,
+    )

@@ -13,7 +13,7 @@ import numpy as np
 
 from animat.execution.task import UNFINISHED
 from animat.progress import Progress
-from animat.training.group import Chunk
+from animat.training.group import Chunk, Group
 from animat.training.policy import Policy
 
 
@@ -68,14 +68,10 @@ class Curves:
     """Passes each row to the callbacks once; used as a progress, it looks for new rows in the folder at each update."""
 
     def __init__(
-        self,
-        folder: Path | None,
-        groups: Sequence[tuple[int, ...]],
-        callbacks: Sequence[TrainingCallback],
-        progress: Progress,
+        self, folder: Path | None, groups: Sequence[Group], callbacks: Sequence[TrainingCallback], progress: Progress
     ) -> None:
         self._folder, self._callbacks, self._progress = folder, callbacks, progress
-        self._n_reported = dict.fromkeys(groups, 0)
+        self._n_reported = {group.members: 0 for group in groups}
         """The number of chunks of each group that the callbacks have."""
 
     def update(self, done: float, total: float, note: str = "") -> None:

@@ -93,13 +93,11 @@ class Dispatch:
     """A client's calls, and where they run; everything but `submit` happens in the client's own thread.
 
     A call whose process or worker ended runs alone on a worker from then on, so that neither it nor another call is
-    blamed for the other's death. Of the workers, those that `select_usable` returns get work.
+    blamed for the other's death. Of the workers, those that `usable_of` returns get work.
     """
 
-    def __init__(
-        self, client: Any, select_usable: Callable[[dict[str, Any]], dict[str, Any]], longest_s: float = LONGEST_S
-    ) -> None:
-        self._client, self._select_usable, self._longest_s = client, select_usable, longest_s
+    def __init__(self, client: Any, usable_of: Callable[[dict[str, Any]], dict[str, Any]], longest_s: float) -> None:
+        self._client, self._usable_of, self._longest_s = client, usable_of, longest_s
         self._waiting: deque[Call] = deque()
         self._places: dict[str, _Place] = {}
         self._batches: dict[str, _Batch] = {}
@@ -141,7 +139,7 @@ class Dispatch:
             self._end()
         elif info is not None:
             self._is_silent = False
-            self._update_places(self._select_usable(info["workers"]))
+            self._update_places(self._usable_of(info["workers"]))
         elif not self._is_silent:
             self._is_silent = True
             _warn(f"the scheduler has not answered for {_SILENT_S:.0f} s; waiting for it")

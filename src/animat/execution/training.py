@@ -63,14 +63,12 @@ def train(
     it trains the others together again, and their last bits differ.
 
     Args:
-        training: what to train.
         timeline: the culture's simulators; None for a training without neurons.
         folder: folder for the policies, created if missing. None: train in this process and write nothing; if stopped,
             training starts again. This also allows robots and mappings that are not registered.
         workers: processes, each pinned to its own core; None: one per core. Not with an executor.
         executor: executor for the groups of policies, which must see the folder; it stays open. None: processes on
             this machine.
-        progress: updated during training.
         checkpoint_s: seconds between checkpoints, which a kill may cost; never changes the result.
         sources, random_return: for the manifest: names of the recordings, and the mean return of random actions, a line
             in the live page's learning curves.
@@ -112,7 +110,7 @@ def train(
         if not is_ours(folder, manifest):
             write_description(folder, manifest)
         missing = [group for group in groups if not _is_trained(group, folder)]
-        curves = Curves(folder, [group.members for group in groups], callbacks, _phase_of(missing, progress))
+        curves = Curves(folder, groups, callbacks, _phase_of(missing, progress))
         if missing:
             tasks = [TrainGroup(group, checkpoint_s, writes_rows=bool(callbacks)) for group in missing]
             left = [Job(as_range(task.group.members), task, cost_s=CHUNKS * len(task.group.members)) for task in tasks]
@@ -186,7 +184,7 @@ def _train_in_memory(
 ) -> dict[str, Policy]:
     """Train the groups in this process, one after the other."""
     trained: dict[str, Policy] = {}
-    curves = Curves(None, [group.members for group in groups], callbacks, progress)
+    curves = Curves(None, groups, callbacks, progress)
     for number, group in enumerate(groups):
         part = Part(progress, number * CHUNKS, CHUNKS, len(groups) * CHUNKS)
         add_chunk = partial(curves.add, group.members) if callbacks else None

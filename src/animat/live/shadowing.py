@@ -53,7 +53,6 @@ class LiveRun:
         swaps: each time a group of policies switched to newer simulators, with the date.
         iterations: fewest training iterations of a policy.
         culture_min, wall_s: time from the first recording to the end of training.
-        gap: predicted against measured return.
     """
 
     recordings: tuple[Path, ...]
@@ -108,7 +107,6 @@ def live(
         culture: open.
         protocol: of every recording.
         folder: for `recordings/`, `policies/`, `session/` and `live.log`, which has a line of JSON per event.
-        timetable: when to record.
         episodes: of each policy in closed loop.
         with_controls: run all controls between the policies' episodes; if not, only the random one.
         adaptive: whether the closed loop's thresholds adapt, or are fixed.
@@ -310,10 +308,13 @@ class _Run:
                 self.write("training began", **swap)
 
     def write(self, what: str, **fields: Any) -> dict[str, Any]:
+        # Its last known time if the connection is lost.
+        with suppress(Exception):
+            self._known_s = self.culture.now_s
         line = {
             "at": datetime.now(UTC).isoformat(timespec="milliseconds"),
             "wall_s": round(time.monotonic() - self._wall_zero_s, 3),
-            "culture_min": round(self._now_s() / 60, 4),
+            "culture_min": round(self._known_s / 60, 4),
             "what": what,
             **fields,
         }
@@ -321,9 +322,3 @@ class _Run:
         with as_invalid_file(log, "cannot be written"), log.open("a") as file:
             file.write(json.dumps(line) + "\n")
         return line
-
-    def _now_s(self) -> float:
-        """The culture's clock; its last known time if the connection is lost."""
-        with suppress(Exception):
-            self._known_s = self.culture.now_s
-        return self._known_s

@@ -147,12 +147,10 @@ class Calibration:
 
     def with_percentiles(self, percentiles: Any) -> Self:
         """The same with one set of percentiles in all simulators, independent of their responses."""
-
-        def fixed(simulator: NeuronSimulator) -> NeuronSimulator:
-            return replace(simulator, percentiles=percentiles)  # type: ignore[type-var]
-
-        bootstraps, own = tuple(map(fixed, self.bootstraps)), np.asarray(percentiles, np.float64)
-        return replace(self, percentiles=own, simulator=fixed(self.simulator), bootstraps=bootstraps)
+        fitted: Any = (self.simulator, *self.bootstraps)
+        simulator, *bootstraps = (replace(each, percentiles=percentiles) for each in fitted)
+        own = np.asarray(percentiles, np.float64)
+        return replace(self, percentiles=own, simulator=simulator, bootstraps=tuple(bootstraps))
 
 
 def reread(responses: Responses, adjusted: AdjustedRanks) -> Responses:

@@ -35,25 +35,19 @@ class Outlook:
         if self.drifted_min is None:
             text += "at least two recordings are needed to estimate the culture's drift"
         else:
-            text += (
-                f"at the drift of the recordings the median response {_when(*self.drifted_min)}, beyond which adaptive "
-                "thresholds may not help"
-            )
-            if self.drifted_min[0] > 0:
-                available_min = min(self.drifted_min[0], available_min)
+            (likely, least), by = self.drifted_min, f"by {100 * LARGE:.0f} %"
+            if likely > 0:
+                when = f"will have changed {by} in {_duration(likely)} ({_duration(max(0.0, least))} at the earliest)"
+                available_min = min(likely, available_min)
             else:
+                when = f"had already changed {by} {_duration(-likely)} ago"
                 remedy = "; use newer recordings, with --at-min or by recording again"
+            text += f"at the drift of the recordings the median response {when}, "
+            text += "beyond which adaptive thresholds may not help"
         if np.isfinite(self.budget_min):
             text += f"; the budget of pulses lasts for about {self.budget_min:.0f} min"
         text += remedy
         return text + ("; the plan is longer: ask for fewer --episodes" if self.planned_min > available_min else "")
-
-
-def _when(likely: float, least: float) -> str:
-    by = f"by {100 * LARGE:.0f} %"
-    if likely <= 0:
-        return f"had already changed {by} {_duration(-likely)} ago"
-    return f"will have changed {by} in {_duration(likely)} ({_duration(max(0.0, least))} at the earliest)"
 
 
 def _duration(minutes: float) -> str:

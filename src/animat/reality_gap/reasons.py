@@ -9,6 +9,7 @@ from typing import Literal
 
 import numpy as np
 from jaxtyping import Float64, Int64
+from scipy.special import stdtr, stdtrit
 
 from animat.reality_gap.calibration import Calibration
 from animat.reality_gap.predicting import Prediction
@@ -160,8 +161,6 @@ def answers(evidence: Evidence) -> Finding | None:
     equally many independent ones as they vary in the session: a task that is hard to control can be lost by thresholds
     that are too low or too high by little.
     """
-    from scipy.stats import t as student
-
     measured, predicted = evidence.session.commanded, evidence.predicted
     episodes, recorded_hz = len(measured.presented), evidence.calibration.responses_hz
     if episodes < FEWEST_EPISODES:
@@ -178,7 +177,7 @@ def answers(evidence: Evidence) -> Finding | None:
         bootstrapped = float(np.nanvar(predicted.commanded_bootstraps.mean[:, i, d]))
         expected_error = max(bootstrapped, _variance(expected, len(recorded_hz[i]))) ** 0.5
         difference = mean - expected
-        p = 2 * student.sf(abs(difference) / np.hypot(error, expected_error), episodes - 1)
+        p = 2 * stdtr(episodes - 1, -abs(difference) / np.hypot(error, expected_error))
         if p < level and abs(difference) >= LEAST_COMMAND:
             most = max(most, difference, key=abs)
             each_hz = responses.read_hz[(responses.condition == i) & evidence.session.moved], recorded_hz[i]
@@ -196,8 +195,6 @@ def answers(evidence: Evidence) -> Finding | None:
 
 def _offset(evidence: Evidence, conditions: Int64[np.ndarray, " conditions"], level: float) -> Finding | None:
     """The mean difference of all commands from the mean that is predicted for their conditions, on each readout."""
-    from scipy.stats import t as student
-
     measured, predicted = evidence.session.commanded, evidence.predicted
     responses, names = evidence.session.responses, evidence.session.responses.readouts.names
     commands = evidence.session.command.reshape(len(responses), -1)
@@ -212,7 +209,7 @@ def _offset(evidence: Evidence, conditions: Int64[np.ndarray, " conditions"], le
         independent = np.array([commands[rows, d].var() for rows in of_each]) / recorded
         error = math.sqrt(between**2 + max(float(np.nanvar(bootstrapped @ shares)), float(shares**2 @ independent)))
         # Without a quotient, as the error is 0 where each condition always leads to the same command.
-        if abs(offset) >= max(LEAST_OFFSET, abs(most)) and abs(offset) > student.isf(level / 2, episodes - 1) * error:
+        if abs(offset) >= max(LEAST_OFFSET, abs(most)) and abs(offset) > -stdtrit(episodes - 1, level / 2) * error:
             most = offset
             message = (
                 f"commands{f' on {name}' if len(names) > 1 else ''} are {'higher' if offset > 0 else 'lower'} than "
@@ -228,8 +225,6 @@ def repetition(evidence: Evidence) -> Finding | None:
     to the same condition; y: a response's rank less the effect of its history (`animat.neurons.history_tracker`), each
     readout separately. As in `answers`, its error is from differences between episodes.
     """
-    from scipy.stats import t as student
-
     session, names = evidence.session, evidence.session.responses.readouts.names
     responses, episodes = session.responses, len(session.returns)
     usable = ~responses.is_burst
@@ -247,7 +242,7 @@ def repetition(evidence: Evidence) -> Finding | None:
         if np.count_nonzero(n) < FEWEST_EPISODES or n.sum() < _LEAST_SHARE * usable.sum():
             continue
         mean, error = _mean_over(total, n)
-        if abs(mean) > max(LEAST_REPETITION, student.isf(LEVEL / len(tested) / 2, episodes - 1) * error):
+        if abs(mean) > max(LEAST_REPETITION, -stdtrit(episodes - 1, LEVEL / len(tested) / 2) * error):
             most = max(most, mean, key=abs)
             on = f" on {names[d]}" if len(names) > 1 else ""
             groups.append(f"{mean:+.2f} +- {error:.2f}{on} {label}")

@@ -7,10 +7,14 @@ from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float64, Int64
+from scipy.special import ndtri, stdtrit
 
 from animat.evaluation.statistics import CONFIDENCE, EpisodeComparison, Interval
 from animat.records import as_json
 
+Returns = Float64[np.ndarray, " episodes"]
+Turns = Int64[np.ndarray, " episodes"]
+"""The return of each episode, and which of its agent's episodes it is."""
 _RESAMPLES = 10_000
 
 
@@ -98,7 +102,6 @@ class Row:
         return -1 if gap.high < 0 else 1 if gap.low > 0 else 0
 
     def to_dict(self) -> dict[str, Any]:
-        """The row as plain data."""
         measured = bool(len(self.measured))
         return {
             "name": self.name,
@@ -130,26 +133,22 @@ def bootstrap_interval(value: float, drawn: Float64[np.ndarray, " draws"]) -> In
 
 
 def resampled_means(
-    returns: Float64[np.ndarray, " episodes"],
-    rng: np.random.Generator,
-    turn: Int64[np.ndarray, " episodes"] | None = None,
+    returns: Returns, rng: np.random.Generator, turn: Turns | None = None
 ) -> Float64[np.ndarray, " resamples"] | None:
     """Means of bootstrap samples of returns, spread as far as Student's t is beyond the normal distribution.
 
     From a few episodes, the usual percentile interval contains the true mean too rarely: from two half of the time.
     Episodes of different agents with the same start are as easy, or as hard: all of them are drawn, or none. There are
-    none for fewer than two episodes, or turns (as in a `Row`).
+    no means for fewer than two episodes, or turns (as in a `Row`).
 
     Source: the expanded percentile interval of Hesterberg 2015, doi:10.1080/00031305.2015.1089789.
     """
-    from scipy.stats import norm, t
-
     of = np.unique(np.arange(len(returns)) if turn is None else turn, return_inverse=True)[1]
     total, count = np.bincount(of, returns), np.bincount(of)
     n, level = len(count), (1 + CONFIDENCE) / 2
     if n < 2:
         return None
     often = rng.multinomial(n, np.full(n, 1 / n), _RESAMPLES)
-    spread = np.sqrt(n / (n - 1)) * t.ppf(level, n - 1) / norm.ppf(level)
+    spread = np.sqrt(n / (n - 1)) * stdtrit(n - 1, level) / ndtri(level)
     mean = returns.mean()
     return np.asarray(mean + spread * (often @ total / (often @ count) - mean))

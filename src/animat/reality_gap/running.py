@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import os
+import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import wait
+from concurrent.futures import Future, wait
 from dataclasses import replace
 from typing import Any
 
@@ -16,7 +17,7 @@ from animat.closed_loop.agents import Agent, Greedy, agent_of
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.running import check_session, run_session
 from animat.closed_loop.session import Session
-from animat.coding.electrode_pulses import electrode_pulses
+from animat.coding.encoder import electrode_pulses
 from animat.cultures.base import Culture
 from animat.cultures.budget import Account
 from animat.cultures.failures import describe_error
@@ -26,28 +27,30 @@ from animat.errors import InvalidArgument
 from animat.evaluation import transfer
 from animat.evaluation.controls import RANDOM, Control, controls_of, coupling_of, interventions_of
 from animat.evaluation.optimal_returns import too_few
+from animat.evaluation.optimum import optimal_values
 from animat.evaluation.rollouts import networks_of
 from animat.evaluation.statistics import compare_episodes
 from animat.goals.tally import Outcome
+from animat.neurons.simulator import NeuronSimulator
 from animat.progress import Progress, in_phase
 from animat.reality_gap.calibration import Calibration
-from animat.reality_gap.interventions import EPISODES, intervention_table
-from animat.reality_gap.optimum import begin_optimum, wait_for_optimum
 from animat.reality_gap.outlook import outlook
 from animat.reality_gap.predicting import BOOTSTRAPS_ON_HOST, ROLL_OUTS, Prediction, episodes_on_host, pool, predict
 from animat.reality_gap.reasons import Evidence, reasons
 from animat.reality_gap.row import Row, bootstrap_interval
 from animat.reality_gap.session_responses import outcomes, read_responses
-from animat.reality_gap.table import RealityGap
+from animat.reality_gap.table import INTERVENTION_EPISODES, RealityGap, intervention_table
 from animat.recordings.findings import Finding, warnings_once
 from animat.robots.base import lacking
-from animat.robots.grid import why_no_grid
+from animat.robots.grid import grid_for, why_no_grid
 from animat.robots.host import HostRobot
 from animat.training.policy import Policy, first_of_alike
 from animat.wrappers import NeuralObservation
 
 FEWEST_OF_A_CONTROL = 5
 """Fewest episodes of a control: enough to show (p < 0.01) that policies with ten or more outperform it."""
+_RESOLUTION = 0.5
+"""Of the optimum's grid: fast and coarse, with an error of 0.8 on the range of 200 of the cartpole."""
 
 
 @checked_arguments
@@ -133,7 +136,7 @@ def run_policies(
             raise InvalidArgument(
                 f"--interventions: expected a robot in JAX, got {loop.robot.name}, which is stepped on the host"
             )
-        simulated = {"episodes": EPISODES, "seed": seed}
+        simulated = {"episodes": INTERVENTION_EPISODES, "seed": seed}
         half_way = trained.run(environment, simulator, **simulated).half_way
         actuator, *changed = interventions_of(environment, simulator, networks, switch_at=half_way)
         ideal = actuator, actuator.run(environment, simulator, **simulated).returns.ravel()
@@ -159,10 +162,10 @@ def run_policies(
         seed=seed,
         progress=in_phase(progress, "predicting"),
     )
-    optimum = begin_optimum(animat, simulator) if why_no_optimum is None else None
+    optimum = _begin_optimum(animat, simulator) if why_no_optimum is None else None
     if optimum is not None and (loop.real_time or not isinstance(culture, VirtualCulture)):
         # Such a loop must not wait for a core.
-        wait_for_optimum(optimum, progress)
+        _wait_for_optimum(optimum, progress)
     plan = [
         (n, predicted[each.name].presented, each.delivery != "silent") for n, each in zip(of_each, agents, strict=True)
     ]
@@ -196,7 +199,7 @@ def run_policies(
     # A user who stopped the session does not wait for it; after any other ending the program would exit meanwhile.
     if optimum is not None and (optimum.done() or session.ending.by != "person"):
         try:
-            best = wait_for_optimum(optimum, progress)
+            best = _wait_for_optimum(optimum, progress)
         except Exception as error:
             findings += (Finding("no-optimum", "note", f"no optimal return: {describe_error(error)}"),)
     rows = _rows(agents, tuple(policies), predicted, session, loop, first.pulse_cost)
@@ -228,7 +231,8 @@ def _warnings(first: Policy, loop: Loop, calibration: Calibration, now_min: floa
             "delivers what they choose"
         )
         yield Finding("trained-as-control", "warning", message)
-    if calibration.simulator.has_memory and loop.pulses == 1 and not loop.warm_up:
+    has_memory = calibration.simulator.has_memory
+    if has_memory and loop.pulses == 1 and not loop.warm_up:
         message = (
             "episodes begin after a rest (--warm-up 0), but on the simulator as after stimuli of all conditions: the "
             "measured return may differ from the prediction"
@@ -243,9 +247,7 @@ def _warnings(first: Policy, loop: Loop, calibration: Calibration, now_min: floa
     yield from transfer.other_simulator(first.fitted, calibration.fitted)
     yield from transfer.other_culture(first.culture, calibration.culture)
     yield from transfer.old_calibration(calibration.start_min, now_min)
-    yield from transfer.no_memory(
-        calibration.findings, calibration.presentation, has_memory=calibration.simulator.has_memory
-    )
+    yield from transfer.no_memory(calibration.findings, calibration.presentation, has_memory=has_memory)
     if isinstance(loop.robot, HostRobot):
         episodes_predicted = ROLL_OUTS * episodes_on_host(loop.robot)
         message = (
@@ -267,6 +269,31 @@ def _why_no_optimum(loop: Loop, calibration: Calibration) -> str | None:
     if few := too_few(loop.conditions, [len(responses) for responses in calibration.responses_hz]):
         reason = f"these conditions have too few responses: {', '.join(few)}"
     return None if reason is None else lacking(loop.robot).get("value_grid", f"no optimal return: {reason}")
+
+
+def _begin_optimum(environment: Animat[Any], simulator: NeuronSimulator) -> Future[float]:
+    """The optimal return, computed in a background thread, on another core than a loop without deadlines."""
+    optimum: Future[float] = Future()
+
+    def work() -> None:
+        try:
+            # Only the value, which is reported as "about": its uncertainty would take a third longer.
+            grid = grid_for(environment.robot).scaled(_RESOLUTION)
+            (value,), _ = optimal_values([(environment, simulator)], grid, seed=1)
+            optimum.set_result(float(value))
+        except BaseException as error:
+            optimum.set_exception(error)
+
+    # A daemon, so that a user who stops the program need not wait for it.
+    threading.Thread(target=work, name="optimal return", daemon=True).start()
+    return optimum
+
+
+def _wait_for_optimum(optimum: Future[float], progress: Progress | None) -> float:
+    """Wait for the value, or raise the error because of which it could not be computed."""
+    if not optimum.done():
+        in_phase(progress, "optimal return").update(0, 1, "computing it on the simulator")
+    return optimum.result()
 
 
 def check_policies(policies: Mapping[str, Policy]) -> Policy:

@@ -1,28 +1,54 @@
-"""The table of predicted and measured returns."""
+"""The table of predicted and measured returns, and that of returns with something in place of the culture."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from animat.closed_loop.loop import Loop
-from animat.closed_loop.session import Session, unanswered_message
-from animat.closed_loop.session_data import describe_left_out
+from animat.closed_loop.session import Session, describe_left_out, unanswered_message
 from animat.columns import align_columns
 from animat.cultures.budget import Account
 from animat.errors import in_min
-from animat.evaluation.statistics import Verdict
+from animat.evaluation.controls import Control
+from animat.evaluation.statistics import CONFIDENCE, Interval, Verdict
 from animat.goals.robot import objectives_of
 from animat.goals.tally import MEANS, cells_of, satisfaction_line
-from animat.reality_gap.interventions import Intervention, intervention_lines
 from animat.reality_gap.outlook import Outlook
 from animat.reality_gap.reasons import CHECKS
-from animat.reality_gap.row import Row
+from animat.reality_gap.row import Returns, Row, Turns, resampled_means
 from animat.recordings.findings import Finding
+from animat.records import as_json
 from animat.tables import briefly
 
 LARGE_SHARE = 0.1
 """Share of the range from random to optimal return: a gap this large is mentioned even if it may be chance."""
+
+
+_INTERVENTIONS = ("random spikes", "silent", "shuffled", "yoked", "turned round", "goal switched")
+"""Interventions that are measured, in the order of the table."""
+INTERVENTION_EPISODES = 100
+"""Episodes of each policy on the simulator, with an ideal actuator and for the median length of an episode."""
+
+
+@dataclass(frozen=True)
+class Intervention:
+    """The same policies with something in place of the culture, in closed loop (`is_measured`) or on its simulator.
+
+    `lost` is the loss against the policies' measured return, with its interval over episodes.
+    """
+
+    name: str
+    meaning: str
+    is_measured: bool
+    mean_return: float
+    lost: Interval
+
+    def to_dict(self) -> dict[str, Any]:
+        return vars(self) | {"lost": as_json(self.lost.to_dict())}
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +62,6 @@ class RealityGap:
         rows: all policies together first, then each of them if there are several, then the controls.
         findings: differences between loop, recording and policies, and other warnings and notes.
         responses: number of the recording's responses, without bursts.
-        outlook: the length of the session as expected beforehand.
         reasons: why the policies' measured return differs from the predicted one, as far as the session's data show.
         whose_work: the policies' return with something in place of the culture; empty if it was not requested.
     """
@@ -89,7 +114,6 @@ class RealityGap:
         return f"{text}, and nothing in the session's data explains it (looked for: {', '.join(CHECKS)})"
 
     def to_dict(self) -> dict[str, Any]:
-        """Everything as plain data."""
         return {
             "robot": self.loop.robot.name,
             "mapping": self.loop.mapping.name,
@@ -159,9 +183,51 @@ class RealityGap:
             f" (the latest {1000 * outline.latest_s:.1f} ms); ended: {self.session.ending.message}",
         ]
         if self.whose_work:
-            lines += intervention_lines(self.rows[0], self.whose_work)
+            lines += _intervention_lines(self.rows[0], self.whose_work)
         if outline.unanswered_pulses:
             lines.append(f"  {unanswered_message(self.session)}")
         if outline.left_out:
             lines.append(f"  left out: {describe_left_out(outline.left_out)}")
         return "\n".join(lines)
+
+
+def intervention_table(rows: Sequence[Row], ideal: Control, with_ideal: Returns) -> tuple[Intervention, ...]:
+    """The table: the simulator, an ideal actuator with its returns on it, then the measured interventions.
+
+    The session's rows have the policies first; without a complete episode of theirs it is empty.
+    """
+    if not len(rows[0].measured):
+        return ()
+    measured = {row.name: row for row in rows if len(row.measured)}
+    lost = _lost(rows[0], with_ideal, None)
+    table = [
+        Intervention("its simulator", "as predicted", False, float(rows[0].predicted.mean()), rows[0].gap),
+        Intervention(ideal.name, ideal.meaning, False, float(with_ideal.mean()), lost),
+    ]
+    for row in (measured[name] for name in _INTERVENTIONS if name in measured):
+        lost = _lost(rows[0], row.measured, row.turn)
+        table.append(Intervention(row.name, row.meaning, True, float(row.measured.mean()), lost))
+    return tuple(table)
+
+
+def _intervention_lines(policies: Row, table: Sequence[Intervention]) -> list[str]:
+    cells = []
+    for each in table:
+        where = "measured" if each.is_measured else "simulator"
+        lost = f"{each.lost.value:.1f}", each.lost.ends
+        cells.append([each.name, f"{each.mean_return:.1f}", *lost, where, each.meaning])
+    return [
+        "whose work is it: return with the culture replaced, and the loss from the measured "
+        f"{policies.measured.mean():.1f}",
+        *align_columns(["", "return", "lost", "95 % interval", "", ""], cells),
+    ]
+
+
+def _lost(usual: Row, changed: Returns, turn: Turns | None) -> Interval:
+    """Difference of means, with its interval over episodes (`resampled_means`); infinite where they are too few."""
+    value, rng = float(usual.measured.mean() - changed.mean()), np.random.default_rng(0)
+    one, other = resampled_means(usual.measured, rng, usual.turn), resampled_means(changed, rng, turn)
+    if one is None or other is None:
+        return Interval(value, -np.inf, np.inf, CONFIDENCE)
+    low, high = np.quantile(one - other, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
+    return Interval(value, float(low), float(high), CONFIDENCE)

@@ -13,6 +13,9 @@ from animat.records import Number, Whole, record
 
 _MOST = 1_000_000
 
+Electrodes = Int64[np.ndarray, " electrodes"]
+OfElectrodes = Float64[np.ndarray, " electrodes"]
+"""Numbers of electrodes, and what is known of each of them."""
 Count = Annotated[Whole, Field(ge=1, le=_MOST)]
 
 
@@ -36,9 +39,7 @@ class ElectrodeArray:
     def __len__(self) -> int:
         return self.columns * self.rows
 
-    def position_um(
-        self, electrode: Int64[np.ndarray, " electrodes"] | int
-    ) -> tuple[Float64[np.ndarray, " electrodes"], Float64[np.ndarray, " electrodes"]]:
+    def position_um(self, electrode: Electrodes | int) -> tuple[OfElectrodes, OfElectrodes]:
         """x and y of electrodes, in micrometres from electrode 0; InvalidArgument for a number not on the array."""
         electrode = np.atleast_1d(np.asarray(electrode, dtype=np.int64))
         outside = (electrode < 0) | (electrode >= len(self))
@@ -49,13 +50,13 @@ class ElectrodeArray:
         return (electrode % self.columns) * self.pitch_um, (electrode // self.columns) * self.pitch_um
 
     def distance_um(
-        self, electrodes: Int64[np.ndarray, " electrodes"] | int, others: Int64[np.ndarray, " others"] | int
+        self, electrodes: Electrodes | int, others: Int64[np.ndarray, " others"] | int
     ) -> Float64[np.ndarray, "electrodes others"]:
         x_um, y_um = self.position_um(electrodes)
         other_x_um, other_y_um = self.position_um(others)
         return np.asarray(np.hypot(x_um[:, None] - other_x_um, y_um[:, None] - other_y_um))
 
-    def scan_blocks(self) -> list[Int64[np.ndarray, " electrodes"]]:
+    def scan_blocks(self) -> list[Electrodes]:
         """All electrodes, in order, in as few blocks as possible, each of which can be recorded at once."""
         return np.array_split(np.arange(len(self), dtype=np.int64), -(-len(self) // self.channels))
 

@@ -7,13 +7,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-SAME = 1e-6
-"""Frequencies that differ by less, relative to their size, are the same."""
-
 
 def is_same(frequency_hz: Any, other_hz: Any) -> Any:
-    """Whether one frequency is the same as another; for arrays, whether each is. An unknown one (NaN) never is."""
-    return np.abs(frequency_hz - other_hz) <= SAME * other_hz
+    """Whether two frequencies are the same within a millionth, also for arrays; an unknown one (NaN) never is."""
+    return np.abs(frequency_hz - other_hz) <= 1e-6 * other_hz
 
 
 def distinct(frequency_hz: Float64[np.ndarray, " pulses"]) -> list[float]:

@@ -8,20 +8,22 @@ import numpy as np
 from jaxtyping import Int64
 
 from animat.errors import InvalidArgument, expect_at_least
-from animat.stimulation.array import ElectrodeArray
+from animat.stimulation.array import ElectrodeArray, Electrodes
 
+Patterns = Int64[np.ndarray, "patterns size"]
+"""Electrodes of each pattern; of patterns of different sizes, padded with -1."""
 _TRIES_A_PATTERN = 200
 
 
 def draw_patterns(
     array: ElectrodeArray,
-    electrodes: Int64[np.ndarray, " electrodes"],
+    electrodes: Electrodes,
     *,
     seed: int,
     patterns: int = 100,
     size: int = 5,
     spacing_um: float = 100.0,
-) -> Int64[np.ndarray, "patterns size"]:
+) -> Patterns:
     """Draw distinct patterns of electrodes, every two electrodes of a pattern more than `spacing_um` apart.
 
     Every set that keeps the distance is equally likely.

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Float64, Int64
 
 from animat.errors import InvalidArgument, InvalidFile, in_file, shown
 from animat.plain_file import is_absent, read_plain_text
 from animat.records import json_data
+from animat.stimulation.array import Electrodes, OfElectrodes
 from animat.tables import evenly
 
 CUT = {"halves": (2, 1), "quadrants": (2, 2)}
@@ -76,10 +76,7 @@ def count_places(places: Places) -> int:
 
 
 def electrodes_of(
-    places: Places,
-    electrodes: Int64[np.ndarray, " electrodes"],
-    x_um: Float64[np.ndarray, " electrodes"],
-    y_um: Float64[np.ndarray, " electrodes"],
+    places: Places, electrodes: Electrodes, x_um: OfElectrodes, y_um: OfElectrodes
 ) -> tuple[tuple[int, ...], ...]:
     """The electrodes of each place, of those that can be stimulated; for `NONE`, no electrodes.
 

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from animat.errors import InvalidArgument, expect_at_least
+from animat.stimulation.patterns import Patterns
 from animat.stimulation.protocol import Protocol
 from animat.stimulation.stimulus import NOTHING, Stimuli, Stimulus
 from animat.tables import UNKNOWN, padded
@@ -79,11 +80,7 @@ class Schedule:
 
 
 def make_schedule(
-    protocol: Protocol,
-    patterns: Int64[np.ndarray, "patterns size"],
-    seed: int,
-    *,
-    places: Sequence[tuple[int, ...]] = (),
+    protocol: Protocol, patterns: Patterns, seed: int, *, places: Sequence[tuple[int, ...]] = ()
 ) -> Schedule:
     """Draw the order of conditions and patterns of one recording, from a seed of zero or more.
 

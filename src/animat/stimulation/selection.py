@@ -10,15 +10,15 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Int64
 from pydantic import Field
 
 from animat.arguments import checked_arguments
 from animat.errors import InvalidArgument, in_file
 from animat.plain_file import read_plain_text
 from animat.records import Number, Whole, json_data, read_record, record
-from animat.stimulation.array import ElectrodeArray
-from animat.stimulation.patterns import draw_patterns
+from animat.stimulation.array import ElectrodeArray, Electrodes, OfElectrodes
+from animat.stimulation.patterns import Patterns, draw_patterns
 from animat.stimulation.scan import ScannedActivity
 from animat.tables import briefly, read_only
 from animat.writing import write_whole
@@ -86,7 +86,7 @@ class Selection:
     array: ElectrodeArray
     recording: Int64[np.ndarray, " channels"]
     stimulation: Int64[np.ndarray, " sites"]
-    patterns: Int64[np.ndarray, "patterns size"]
+    patterns: Patterns
     rule: SelectionRule = field(default_factory=SelectionRule)
     seed: int = 0
     scanned: int = 0
@@ -183,20 +183,15 @@ def select_electrodes(
         )
     worth = (scan.amplitude_uv * scan.excitatory_score)[recording]
     stimulation = recording[np.lexsort((scan.electrode[recording], -worth))][: rule.stimulation_sites]
-    electrodes = np.sort(scan.electrode[stimulation])
+    chosen = np.sort(scan.electrode[stimulation])
     patterns = draw_patterns(
-        array, electrodes, seed=seed, patterns=rule.patterns, size=rule.pattern_size, spacing_um=rule.pattern_spacing_um
+        array, chosen, seed=seed, patterns=rule.patterns, size=rule.pattern_size, spacing_um=rule.pattern_spacing_um
     )
-    return Selection(
-        array, np.sort(scan.electrode[recording]), electrodes, patterns, rule, seed, len(scan), len(passed)
-    )
+    return Selection(array, np.sort(scan.electrode[recording]), chosen, patterns, rule, seed, len(scan), len(passed))
 
 
 def _is_best_nearby(
-    array: ElectrodeArray,
-    electrode: Int64[np.ndarray, " electrodes"],
-    ratio: Float64[np.ndarray, " electrodes"],
-    spacing_um: float,
+    array: ElectrodeArray, electrode: Electrodes, ratio: OfElectrodes, spacing_um: float
 ) -> np.ndarray[Any, np.dtype[np.bool_]]:
     """Whether no electrode within the spacing has a higher ratio; of two equal ones the lower number wins."""
     reach = int(spacing_um / array.pitch_um)

@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import BeforeValidator, Field, InstanceOf, PlainValidator
 
 from animat.coding.decoder import expect_one_command
-from animat.coding.electrode_pulses import expect_electrode_pulses
+from animat.coding.encoder import expect_electrode_pulses
 from animat.coding.mapping import Mapping, mapping_named, mapping_to_data, register_mapping
 from animat.environment import Animat, Environment, WithoutNeurons
 from animat.errors import InvalidArgument, shown
@@ -98,7 +98,7 @@ class Training:
         lessons: lessons in turn, each with ranges from which episodes are drawn; a last one with a threshold is
             followed by the task itself.
         pulse_cost: cost of an electrode pulse, in the units of the reward: policies are trained on the rewards minus
-            the costs of their trials (`animat.coding.electrode_pulses`). Reported returns do not include the cost.
+            the costs of their trials (`animat.coding.encoder`). Reported returns do not include the cost.
         assess: episodes of the assessment at the end of each chunk, by which the best policy so far is kept; None:
             no assessments, except that lessons with a threshold use 20.
 

@@ -63,15 +63,13 @@ class TuningResult:
     importance: Mapping[str, float]
 
     def to_dict(self) -> dict[str, Any]:
-        """The result as plain data."""
         rows = [
             {**asdict(final), "mean_return": None if final.returns is None else final.mean,
              "standard_error": final.standard_error}
             for final in self.finals
         ]  # fmt: skip
-        counts = {
-            state: sum(trial.state == state for trial in self.trials) for state in ("complete", "stopped", "diverged")
-        }
+        states = [trial.state for trial in self.trials]
+        counts = {state: states.count(state) for state in ("complete", "stopped", "diverged")}
         best = {"trial": self.best.trial, "settings": self.best.settings}
         return {"best": best, "finals": rows, "trials": counts, "importance": dict(self.importance)}
 

@@ -229,7 +229,6 @@ class Tuning:
     space: Space
 
     def to_dict(self) -> dict[str, Any]:
-        """The specification as plain data."""
         space = {name: asdict(of) if isinstance(of, Range) else list(of) for name, of in self.space.items()}
         return {"study": asdict(self.study), "tune": {**asdict(self.tune), "search": space}}
 

@@ -134,7 +134,6 @@ class TrainTrials(StudyTask):
     Attributes:
         members: numbers of the trials' policies.
         seeds: of training and, for the group of the first policies, of the episodes.
-        episodes: per policy.
         chunks: the chunks of training, from the first up to but excluding the last.
         place: folder of the returns and, up to the end of training, of the learners, relative to the tuning's.
     """

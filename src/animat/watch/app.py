@@ -22,12 +22,11 @@ from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket
 
 from animat.errors import AnimatError, InvalidArgument, first_line
-from animat.watch.cultures import CulturesView
 from animat.watch.discovery import find, place_within
 from animat.watch.plain import text
 from animat.watch.recording import RecordingView
 from animat.watch.session import SessionView, stop_session
-from animat.watch.study import StudyView
+from animat.watch.study import CulturesView, StudyView
 from animat.watch.training import TrainingView
 from animat.watch.tuning import TuningView
 from animat.watch.view import View

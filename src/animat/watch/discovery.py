@@ -10,7 +10,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from animat.closed_loop.session_data import LOG_FILE
+from animat.closed_loop.session import LOG_FILE
 from animat.cultures.under_way import UNDER_WAY
 from animat.errors import InvalidArgument
 from animat.execution.task import UNFINISHED

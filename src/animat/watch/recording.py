@@ -11,6 +11,7 @@ import numpy as np
 from animat.cultures.under_way import UNDER_WAY
 from animat.errors import AnimatError, InvalidFile, counted
 from animat.plain_file import expect_plain_file
+from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
 from animat.responses.inspection import Inspection, inspect_recording
 from animat.watch.discovery import is_locked, recordings_in
@@ -96,8 +97,6 @@ def _facts(inspection: Inspection | None, n_whole: int, newest: Path) -> list[tu
 
 
 def _read(file: Path) -> _Content:
-    from animat.recordings.reading import read_recording
-
     try:
         recording = read_recording(expect_plain_file(file, most_bytes=2**31))
         return recording, inspect_recording(recording, name=file.name), ""

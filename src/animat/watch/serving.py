@@ -35,16 +35,10 @@ def expect_installed() -> None:
 
 
 def serve(folder: Path, port: int, announce: Callable[[str], None], *, parent: int | None = None) -> None:
-    """Serve the page of a folder until Ctrl-C.
+    """Serve the page of a folder until Ctrl-C, on a port (0: any free one); `announce` is called with the address.
 
-    Args:
-        port: 0 for any free port.
-        announce: called with the address.
-        parent: id of a process; the server ends a minute after it has ended and the page was last requested.
-
-    Raises:
-        AnimatError: if the page's requirements are not installed.
-        InvalidArgument: if the port is not available.
+    With a `parent`, the id of a process, it ends a minute after that process has ended and the page was last requested.
+    Raises AnimatError if the page's requirements are not installed, and InvalidArgument if the port is not available.
     """
     expect_installed()
     import uvicorn

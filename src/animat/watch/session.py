@@ -16,7 +16,7 @@ from PIL import Image
 
 from animat.closed_loop.header import Header, read_header
 from animat.closed_loop.log import Record
-from animat.closed_loop.session_data import LOG_FILE, RECORDING_FILE
+from animat.closed_loop.session import LOG_FILE, RECORDING_FILE
 from animat.closed_loop.tick import STOP_FILE
 from animat.coding.mapping import Thresholds
 from animat.errors import InvalidArgument, InvalidFile, as_invalid_file
@@ -27,8 +27,7 @@ from animat.robots.drawing import draw_robot
 from animat.stimulation.stimulus import NOTHING
 from animat.watch.discovery import is_locked
 from animat.watch.plain import mapped, number, numbers, packed, text
-from animat.watch.sums import PercentilesSince, Sums, by_agent, first_readout
-from animat.watch.tail import Tail
+from animat.watch.tail import PercentilesSince, Sums, Tail, by_agent, first_readout
 from animat.watch.view import View, time_left
 
 _MOST_RECORDS = 8000

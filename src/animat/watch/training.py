@@ -33,8 +33,6 @@ Curves: TypeAlias = dict[int, Float64[np.ndarray, "chunks columns"]]
 
 
 class TrainingView(View):
-    """The folder of a training."""
-
     kind = "training"
 
     def __init__(self, folder: Path) -> None:

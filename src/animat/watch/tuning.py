@@ -19,8 +19,6 @@ _STATES = {"complete": "complete", "stopped": "stopped early", "diverged": "dive
 
 
 class TuningView(View):
-    """The folder of a tuning."""
-
     kind = "tuning"
 
     def _title(self) -> str:

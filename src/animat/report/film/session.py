@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 
 from animat.closed_loop.header import read_header
-from animat.closed_loop.session import read_session
-from animat.closed_loop.session_data import LOG_FILE, expect_session_log
+from animat.closed_loop.session import LOG_FILE, expect_session_log, read_session
 from animat.closed_loop.tick import Tick
 from animat.errors import InvalidArgument, UnusableData
 from animat.goals.robot import robot_of
