@@ -79,6 +79,7 @@ class CL1Culture(Culture):
     """
 
     name: ClassVar[str] = "cl1"
+    sampling_rate_hz = float(FRAMES_PER_S)
 
     def __init__(
         self,
@@ -143,10 +144,6 @@ class CL1Culture(Culture):
         """The device's clock, which starts with the device, not when it is opened."""
         with as_device_failure("CL1", "report its time"):
             return float(while_open(self._session).neurons.timestamp() / FRAMES_PER_S)
-
-    @property
-    def sampling_rate_hz(self) -> float:
-        return float(FRAMES_PER_S)
 
     @property
     def recorded_as(self) -> RecordedCulture:

@@ -76,6 +76,8 @@ class MaxOneCulture(Culture):
     """
 
     name: ClassVar[str] = "maxone"
+    sampling_rate_hz = float(FRAMES_PER_S)
+    recorded_as = RecordedCulture("maxone")
 
     def __init__(
         self,
@@ -147,14 +149,6 @@ class MaxOneCulture(Culture):
     def now_s(self) -> float:
         """Time since it was first opened, by the newest frame received."""
         return (while_open(self._stream).frame() - self._zero_frame) / FRAMES_PER_S
-
-    @property
-    def sampling_rate_hz(self) -> float:
-        return float(FRAMES_PER_S)
-
-    @property
-    def recorded_as(self) -> RecordedCulture:
-        return RecordedCulture("maxone")
 
     @property
     def provenance(self) -> dict[str, str]:
