@@ -16,7 +16,7 @@ from animat.recordings.formats.cl1 import is_cl1, read_cl1
 from animat.recordings.formats.foreign_nwb import read_foreign_nwb
 from animat.recordings.formats.hdf5 import PLUGIN_ADVICE, Hdf5File, choose, hdf5_file, is_positive, unavailable_filters
 from animat.recordings.formats.maxwell import OLD_CHANNELS, is_maxwell, is_old, parts, read_maxwell
-from animat.recordings.formats.nwb import is_nwb, read_nwb
+from animat.recordings.formats.nwb import read_nwb
 from animat.recordings.raw import RawTraces, in_microvolts
 from animat.recordings.recording import Channels, Recording
 from animat.tables import UNKNOWN
@@ -29,7 +29,7 @@ Scale = float | Float64[np.ndarray, " channels"]
 
 def _format_of(file: Hdf5File) -> Literal["NWB", "MaxWell", "CL1"]:
     """The format of an open file; refuses an unknown one."""
-    if is_nwb(file):
+    if "nwb_version" in file.file.attrs:
         return "NWB"
     if is_maxwell(file):
         return "MaxWell"

@@ -118,11 +118,6 @@ class _Disk(io.FileIO):
             return size or 0
 
 
-def is_nwb(file: Hdf5File) -> bool:
-    """Whether a file declares itself as NWB."""
-    return "nwb_version" in file.file.attrs
-
-
 def read_nwb(file: Hdf5File, stimuli: str | None = None) -> Recording:
     """Read an open file of `write_nwb`, which equals the original recording, or of another program."""
     path = file.path
