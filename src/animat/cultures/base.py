@@ -29,6 +29,11 @@ from animat.stimulation.schedule import Block, Schedule, make_schedule
 from animat.stimulation.stimulus import Stimulus, plain_stimuli
 from animat.tables import UNKNOWN
 
+_BEFORE_ALL = ("__getattribute__", "__setattr__", "__delattr__", "__copy__", "__deepcopy__")
+"""Python calls these before, or instead of, the base class's attributes."""
+_REPLACEABLE = ("__init__", "left_out", "device", "recorded_as", "stretch_s")
+"""What a backend may override although it is not abstract."""
+
 
 class Culture(Openable):
     """A culture on an array: open it, stimulate it, record it, let time pass, close it.
@@ -45,7 +50,19 @@ class Culture(Openable):
 
     def __init_subclass__(cls, **keywords: Any) -> None:
         super().__init_subclass__(**keywords)
-        _refuse_overrides(cls)
+        # Refuse one that replaces anything else of `Culture`, even through another base class.
+        own = {
+            name: member
+            for kind in reversed(Culture.__mro__)
+            for name, member in vars(kind).items()
+            if kind.__module__.startswith(f"{__package__}.")
+            and isinstance(member, FunctionType | property | classmethod)
+            and not getattr(member, "__isabstractmethod__", False)
+            and name not in _REPLACEABLE
+        } | {name: getattr_static(Culture, name, None) for name in _BEFORE_ALL}
+        for name, member in own.items():
+            if getattr_static(cls, name, None) is not member:
+                raise TypeError(f"{cls.__name__}.{name}: final in Culture; implement only what is abstract")
 
     @property
     @abc.abstractmethod
@@ -269,28 +286,6 @@ def _plain_duration(duration_s: float) -> float:
     if not 0 <= duration_s < float("inf"):
         raise InvalidArgument(f"duration_s: expected a finite number of seconds from 0, got {duration_s}")
     return duration_s
-
-
-_BEFORE_ALL = ("__getattribute__", "__setattr__", "__delattr__", "__copy__", "__deepcopy__")
-"""Python calls these before, or instead of, the base class's attributes."""
-_REPLACEABLE = ("__init__", "left_out", "device", "recorded_as", "stretch_s")
-"""What a backend may override although it is not abstract."""
-
-
-def _refuse_overrides(cls: type[Culture]) -> None:
-    """Raise TypeError for a subclass that replaces anything else of `Culture`, even through another base class."""
-    own = {
-        name: member
-        for kind in reversed(Culture.__mro__)
-        for name, member in vars(kind).items()
-        if kind.__module__.startswith(f"{__package__}.")
-        and isinstance(member, FunctionType | property | classmethod)
-        and not getattr(member, "__isabstractmethod__", False)
-        and name not in _REPLACEABLE
-    } | {name: getattr_static(Culture, name, None) for name in _BEFORE_ALL}
-    for name, member in own.items():
-        if getattr_static(cls, name, None) is not member:
-            raise TypeError(f"{cls.__name__}.{name}: final in Culture; implement only what is abstract")
 
 
 class ComputedCulture(Culture):
