@@ -10,7 +10,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,9 +24,9 @@ from animat.closed_loop.log import LogWriter, Record, read_log
 from animat.closed_loop.running import run_session
 from animat.closed_loop.session import LOG_FILE, Session, read_session, recover_session
 from animat.closed_loop.stretch import check_answer
+from animat.cultures import base
 from animat.cultures.budget import Account, Budget
 from animat.cultures.observed import Observed, Spikes
-from animat.cultures.request import Request
 from animat.cultures.safety import SIMULATED_LIMITS
 from animat.errors import InvalidArgument, InvalidFile, UnsafeStimulus, UnusableData
 from animat.recordings.reading import read_recording
@@ -695,17 +695,17 @@ def test_the_budget_runs_out(tmp_path: Path, kind: str) -> None:
 def test_what_was_refused_is_not_spent_although_another_delivery_came_between(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    requests, of = [], Request.of
+    requests, plain_request = [], base._plain_request
 
-    def after_another(stimuli: Any, duration_s: float) -> Request:
-        request = of(stimuli, duration_s)
-        requests.append(len(request.stimuli))
-        if sum(requests) == 8 and request.stimuli:
+    def after_another(stimuli: Any, duration_s: float) -> tuple[Sequence[Stimulus], float]:
+        request = plain_request(stimuli, duration_s)
+        requests.append(len(request[0]))
+        if sum(requests) == 8 and request[0]:
             # As another thread's would, it takes the last place of the session.
             culture.deliver([Stimulus(0.0, (100,), BALANCED_PULSE)], 0.001)
         return request
 
-    monkeypatch.setattr(Request, "of", staticmethod(after_another))
+    monkeypatch.setattr(base, "_plain_request", after_another)
     account = Account(Budget())
     with FakeCulture(limits=replace(SIMULATED_LIMITS, stimuli_per_session=8)) as culture:
         session = run_session(culture, loop_of(robot=LONG), [RANDOM], tmp_path, account=account, episodes=1)

@@ -19,7 +19,7 @@ from animat.cultures.tissue import Tissue, TissueParameters
 from animat.cultures.tissue.parameters import ShortTerm
 from animat.cultures.tissue.tissue import Spikes
 from animat.cultures.virtual import WARM_UP_S, VirtualCulture
-from animat.cultures.visibility import NOISE_UV
+from animat.cultures.visibility import NOISE_UV, Pairs
 from animat.errors import InvalidArgument, InvalidFile, Mismatch, UnusableData
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.reading import read_recording
@@ -58,7 +58,7 @@ def test_an_electrode_sees_every_neuron_within_25_um_and_no_other(culture: Virtu
 def test_spikes_are_smaller_with_distance_and_never_lost_in_noise(culture: VirtualCulture) -> None:
     seen = culture.visibility
     every = np.arange(300)
-    at_soma, halfway, far = (seen.amplitude_at(every, np.full(300, d)) for d in (0.0, 15.0, 25.0))
+    at_soma, halfway, far = (seen.amplitude_at(Pairs(every, every, np.full(300, d))) for d in (0.0, 15.0, 25.0))
     assert np.all((at_soma >= 60) & (at_soma <= 300))
     np.testing.assert_allclose(halfway, at_soma / 2)
     assert far.min() > 5 * NOISE_UV

@@ -16,11 +16,15 @@ from animat.cultures.traces import Traces, record_traces
 from animat.errors import InvalidArgument, InvalidFile
 from animat.recordings.conversion import read_traces
 from animat.recordings.detection.artefacts import without_artefacts
-from animat.recordings.detection.band import band_pass
-from animat.recordings.detection.negative_peaks import find_negative_peaks, median_noise_uv
 from animat.recordings.detection.settings import Detection
-from animat.recordings.detection.spikes import DetectedSpikes, detect_spikes
-from animat.recordings.formats.traces import open_traces
+from animat.recordings.detection.spikes import (
+    DetectedSpikes,
+    band_pass,
+    detect_spikes,
+    find_negative_peaks,
+    median_noise_uv,
+)
+from animat.recordings.formats.hdf5_formats import open_traces
 from animat.recordings.raw import RawTraces, in_microvolts
 from animat.recordings.recording import Channels
 from animat.stimulation.pulse import PUBLISHED_PULSE
@@ -108,6 +112,8 @@ def test_the_filter_is_the_two_pass_butterworth() -> None:
     expected = signal.sosfiltfilt(sections, voltage.astype(np.float64), axis=1)
     filtered = band_pass(voltage, (100.0, 3000.0), RATE_HZ)
     np.testing.assert_allclose(filtered[:, 1000:-1000], expected[:, 1000:-1000], atol=2e-3)
+    # Without a band, traces are filtered already.
+    np.testing.assert_array_equal(band_pass(voltage, None, RATE_HZ).T, voltage.T - np.median(voltage, axis=1))
 
 
 @settings(deadline=None, max_examples=60)

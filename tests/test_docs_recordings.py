@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from animat.recordings.reading import read_recording, read_source
-from animat.recordings.response_table import ResponseTable
+from animat.recordings.recording import ResponseTable
 from synthetic_recordings import write_synthetic_series
 
 

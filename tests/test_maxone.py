@@ -15,7 +15,7 @@ import pytest
 from animat.cultures.base import Culture
 from animat.cultures.contract import CultureContract
 from animat.cultures.devices.maxone import MAXONE_LIMITS, MaxOneCulture
-from animat.cultures.devices.maxone_sequences import dac_code
+from animat.cultures.devices.maxone_commands import dac_code
 from animat.cultures.devices.maxone_stream import EVENT_16, EVENT_24, ZmqSpikes
 from animat.cultures.same_culture import other_channels
 from animat.errors import DeviceFailed, InvalidArgument, UnsafeStimulus

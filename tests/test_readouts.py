@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from animat.errors import InvalidArgument, InvalidFile, Mismatch
-from animat.recordings.recording import Channels, Recording
-from animat.recordings.response_table import ResponseTable
+from animat.recordings.recording import Channels, Recording, ResponseTable
 from animat.responses.extraction import extract_responses, extract_series
 from animat.responses.quality.responses import _readouts
 from animat.responses.readouts import ALL, Readouts, count_readouts, read_readouts, readouts_on

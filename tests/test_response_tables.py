@@ -12,8 +12,7 @@ from animat.cli import main
 from animat.errors import AnimatError, InvalidFile
 from animat.recordings.quality import recording_findings
 from animat.recordings.reading import read_recording, read_source, read_sources
-from animat.recordings.recording import Recording
-from animat.recordings.response_table import ResponseTable
+from animat.recordings.recording import Recording, ResponseTable
 from animat.report.inspection import inspection_text
 from animat.responses.conditions import ByInterval, ByPattern, Conditions
 from animat.responses.extraction import extract_responses

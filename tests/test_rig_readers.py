@@ -15,9 +15,8 @@ from animat.cultures.devices.cl1 import CL1Culture
 from animat.errors import InvalidArgument, InvalidFile
 from animat.recordings.conversion import read_traces
 from animat.recordings.formats.cl1_layout import SITES
-from animat.recordings.formats.hdf5_formats import read_hdf5
+from animat.recordings.formats.hdf5_formats import open_traces, read_hdf5
 from animat.recordings.formats.stimulus_text import stimulus_columns
-from animat.recordings.formats.traces import open_traces
 from animat.recordings.quality import recording_findings
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording

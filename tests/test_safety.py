@@ -16,8 +16,7 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
-from animat.cultures.history import History
-from animat.cultures.safety import SIMULATED_LIMITS, Admitted, Guard, Limits
+from animat.cultures.safety import SIMULATED_LIMITS, Admitted, Guard, History, Limits
 from animat.errors import InvalidArgument, UnsafeStimulus
 from animat.stimulation.pulse import BALANCED_PULSE, PUBLISHED_PULSE, Phase, Pulse
 from animat.stimulation.stimulus import Stimulus

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from animat.cultures.tissue import Tissue
-from animat.cultures.tissue.drift import MARK_S, Drift
 from animat.cultures.tissue.parameters import TissueParameters
+from animat.cultures.tissue.tissue import MARK_S, Drift
 from animat.errors import InvalidArgument, InvalidFile
 from cultures import small_culture
 

@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 
 from animat.cultures.tissue import Pulse, ShortTerm, Spikes, Tissue, TissueParameters
 from animat.cultures.tissue.coupling import Kicks
-from animat.cultures.tissue.drift import Drift
 from animat.cultures.tissue.kernel import AXONAL_KICK_MV
 from animat.cultures.tissue.network import _communities, grow
 from animat.cultures.tissue.preparation import block_polynomial, nmda_block, prepare_wiring
+from animat.cultures.tissue.tissue import Drift
 from animat.errors import InvalidArgument, Mismatch
 
 SMALL = TissueParameters(neurons=200, width_um=1500.0, height_um=1000.0, in_degree_e=40, in_degree_i=15)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from inspect import getattr_static
-from itertools import chain
+from itertools import chain, pairwise
 from types import FunctionType
 from typing import Any, ClassVar, final
 
@@ -17,7 +17,6 @@ from jaxtyping import Int64
 from animat.cultures.failures import as_device_failure
 from animat.cultures.observed import Observed, Spikes, assemble, more_left_out, with_rests
 from animat.cultures.openable import Openable
-from animat.cultures.request import Request, plain_duration
 from animat.cultures.safety import SIMULATED_LIMITS, Admitted, Limits
 from animat.errors import AnimatError, InvalidArgument, expect_kind, some_of
 from animat.progress import Progress, Silent
@@ -28,8 +27,13 @@ from animat.stimulation.plain import number, seconds
 from animat.stimulation.protocol import Protocol
 from animat.stimulation.pulse import Pulse
 from animat.stimulation.schedule import Block, Schedule, make_schedule
-from animat.stimulation.stimulus import Stimulus
+from animat.stimulation.stimulus import Stimulus, plain_stimuli
 from animat.tables import UNKNOWN
+
+_BEFORE_ALL = ("__getattribute__", "__setattr__", "__delattr__", "__copy__", "__deepcopy__")
+"""Python calls these before, or instead of, the base class's attributes."""
+_REPLACEABLE = ("__init__", "left_out", "device", "recorded_as", "stretch_s")
+"""What a backend may override although it is not abstract."""
 
 
 class Culture(Openable):
@@ -47,7 +51,19 @@ class Culture(Openable):
 
     def __init_subclass__(cls, **keywords: Any) -> None:
         super().__init_subclass__(**keywords)
-        _refuse_overrides(cls)
+        # Refuse one that replaces anything else of `Culture`, even through another base class.
+        own = {
+            name: member
+            for kind in reversed(Culture.__mro__)
+            for name, member in vars(kind).items()
+            if kind.__module__.startswith(f"{__package__}.")
+            and isinstance(member, FunctionType | property | classmethod)
+            and not getattr(member, "__isabstractmethod__", False)
+            and name not in _REPLACEABLE
+        } | {name: getattr_static(Culture, name, None) for name in _BEFORE_ALL}
+        for name, member in own.items():
+            if getattr_static(cls, name, None) is not member:
+                raise TypeError(f"{cls.__name__}.{name}: final in Culture; implement only what is abstract")
 
     @property
     @abc.abstractmethod
@@ -105,18 +121,27 @@ class Culture(Openable):
                 than float64, or a `since_s` that the clock has not reached.
             DeviceFailed: if the device fails meanwhile; with `is_admitted` true, the request may have been delivered.
         """
-        turns, request, admitted = self._opened(), Request.of(stimuli, duration_s), None
+        turns, admitted = self._opened(), None
+        stimuli, duration_s = _plain_request(stimuli, duration_s)
         try:
             with as_device_failure(self.name, "deliver"), turns as guard:
                 now_s = seconds("now_s", self.now_s)
                 if since_s is not None and since_s != now_s:
-                    request = request.counted_from(seconds("since_s", since_s), now_s)
+                    since_s = seconds("since_s", since_s)
+                    if not since_s <= now_s:
+                        expected = f"a reading of the clock, which is at {now_s:g} s"
+                        raise InvalidArgument(f"since_s: expected {expected}, got {since_s}")
+                    # All are moved equally, so that intervals stay as requested; what is overdue begins now. Times
+                    # below 0 are left to the guard.
+                    passed_s = min(now_s - since_s, max(0.0, stimuli[0].time_s) if stimuli else duration_s)
+                    stimuli = [replace(stimulus, time_s=stimulus.time_s - passed_s) for stimulus in stimuli]
+                    duration_s -= passed_s
                 # Rests go neither to the guard nor to the backend.
-                pulses = [stimulus for stimulus in request.stimuli if not stimulus.is_rest]
-                if request.stimuli and not pulses:
+                pulses = [stimulus for stimulus in stimuli if not stimulus.is_rest]
+                if stimuli and not pulses:
                     guard.expect_not_stopped()
                 admitted = guard.admit(pulses, now_s)
-                return with_rests(self._deliver(admitted, request.duration_s), request.stimuli, now_s)
+                return with_rests(self._deliver(admitted, duration_s), stimuli, now_s)
         except AnimatError as error:
             error.is_admitted = admitted is not None and len(admitted.stimuli) > 0
             raise
@@ -133,7 +158,7 @@ class Culture(Openable):
         Raises:
             InvalidArgument, DeviceFailed: as `deliver` does.
         """
-        turns, duration_s = self._opened(), plain_duration(duration_s)
+        turns, duration_s = self._opened(), _plain_duration(duration_s)
         with as_device_failure(self.name, "rest"), turns:
             self._rest(duration_s)
 
@@ -246,26 +271,25 @@ class Culture(Openable):
             guard.check(pulses, self.now_s)
 
 
-_BEFORE_ALL = ("__getattribute__", "__setattr__", "__delattr__", "__copy__", "__deepcopy__")
-"""Python calls these before, or instead of, the base class's attributes."""
-_REPLACEABLE = ("__init__", "left_out", "device", "recorded_as", "stretch_s")
-"""What a backend may override although it is not abstract."""
+def _plain_request(stimuli: Iterable[Stimulus], duration_s: float) -> tuple[Sequence[Stimulus], float]:
+    """The arguments of a delivery as immutable plain values; refuses anything else, and a stimulus after the end."""
+    stimuli, duration_s = plain_stimuli(stimuli), _plain_duration(duration_s)
+    times_s = [stimulus.time_s for stimulus in stimuli]
+    if late_s := [time_s for time_s in times_s if not time_s < duration_s]:
+        expected = f"times before the delivery ends ({duration_s:g} s)"
+        raise InvalidArgument(f"stimuli: expected {expected}, got {late_s[0]:g} s")
+    # The guard checks the times of pulses, and does not see rests.
+    has_rests = any(stimulus.is_rest for stimulus in stimuli)
+    if has_rests and not all(before <= after for before, after in pairwise([0.0, *times_s])):
+        raise InvalidArgument(f"stimuli: expected times from 0 s in ascending order, got {times_s[:5]}")
+    return stimuli, duration_s
 
 
-def _refuse_overrides(cls: type[Culture]) -> None:
-    """Raise TypeError for a subclass that replaces anything else of `Culture`, even through another base class."""
-    own = {
-        name: member
-        for kind in reversed(Culture.__mro__)
-        for name, member in vars(kind).items()
-        if kind.__module__.startswith(f"{__package__}.")
-        and isinstance(member, FunctionType | property | classmethod)
-        and not getattr(member, "__isabstractmethod__", False)
-        and name not in _REPLACEABLE
-    } | {name: getattr_static(Culture, name, None) for name in _BEFORE_ALL}
-    for name, member in own.items():
-        if getattr_static(cls, name, None) is not member:
-            raise TypeError(f"{cls.__name__}.{name}: final in Culture; implement only what is abstract")
+def _plain_duration(duration_s: float) -> float:
+    duration_s = seconds("duration_s", duration_s)
+    if not 0 <= duration_s < float("inf"):
+        raise InvalidArgument(f"duration_s: expected a finite number of seconds from 0, got {duration_s}")
+    return duration_s
 
 
 class ComputedCulture(Culture):

@@ -110,12 +110,9 @@ def record_within(
     progress: Progress | None = None,
     follow: Callable[[Callable[[], Recording]], None] | None = None,
 ) -> Recording:
-    """Record by a protocol, as `Culture.record` does, if the budget covers all of it.
+    """Record by a protocol, as `Culture.record` does; raises `BudgetSpent` unless the budget covers all of it.
 
     If a recording fails half way, only what it had handed to the culture is spent.
-
-    Raises:
-        BudgetSpent: if the budget does not cover it; nothing is then delivered. Others as `Culture.record` does.
     """
     schedule = culture.schedule(protocol, seed)
     by_block = [schedule.deliveries(block) for block in schedule.blocks]

@@ -29,11 +29,7 @@ def of_the_program(device: str) -> Path:
 
 @contextmanager
 def hold(device: Path, holder: str) -> Iterator[bool]:
-    """Hold a device exclusively until the block or the process ends; yields whether another `holder` had it last.
-
-    Raises:
-        DeviceFailed: if another one holds it, or the folder that represents it cannot be used.
-    """
+    """Hold a device exclusively until the block or the process ends; yields whether another `holder` had it last."""
     with ExitStack() as stack:
         try:
             # In a world-writable folder another user could point a link at one of ours.

@@ -33,11 +33,6 @@ def culture_of(
         recordings: from which a replay answers.
         selection: file with the electrodes of a MaxOne (`Selection.save`).
         progress: updated during a virtual culture's scan.
-
-    Raises:
-        InvalidArgument: for an unknown kind, a seed below 0, a state or a selection for a kind that takes none, or a
-            MaxOne without a selection.
-        InvalidFile, Mismatch: if the state is damaged, or another culture's.
     """
     expect_at_least("seed", seed, 0)
     for name, value, taken_by in (("state", state, "virtual"), ("selection", selection, "maxone")):

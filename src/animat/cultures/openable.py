@@ -12,10 +12,9 @@ from pathlib import Path
 from typing import Any, ClassVar, NoReturn, Self, final
 
 from animat.cultures.failures import as_device_failure, while_open
-from animat.cultures.history import History
 from animat.cultures.holding import hold
 from animat.cultures.limits import Limits, plain_limits
-from animat.cultures.safety import Guard
+from animat.cultures.safety import Guard, History
 from animat.errors import InvalidArgument, UnsafeStimulus
 from animat.stimulation.plain import seconds
 
@@ -34,12 +33,6 @@ class Turns:
         self.guard = guard
         self._lock = threading.RLock()
         self._is_taken = self._is_over = False
-        self._process = os.getpid()
-
-    @property
-    def is_elsewhere(self) -> bool:
-        """Whether this is a copy that a fork made of another process's turns."""
-        return self._process != os.getpid()
 
     def __enter__(self) -> Guard:
         while not self._lock.acquire(timeout=_LOOK_S):
@@ -198,7 +191,7 @@ class Openable(abc.ABC):
             if turns is None:
                 return
             with as_device_failure(self.name, "close"), self.__hold.pop_all():
-                if turns.is_elsewhere:
+                if not is_ours:
                     # A fork's copy is not a culture of this process, which must not close the device.
                     return
                 try:
@@ -263,6 +256,6 @@ class Openable(abc.ABC):
 
     def _opened(self) -> Turns:
         turns = while_open(self.__turns)
-        if turns.is_elsewhere:
+        if self.__process != os.getpid():
             raise InvalidArgument("culture: expected one that this process opened, got a copy made by a fork")
         return turns

@@ -44,6 +44,7 @@ class ReplayCulture(ComputedCulture):
     """
 
     name: ClassVar[str] = "replay"
+    recorded_as = RecordedCulture("replay")
 
     @checked_arguments
     def __init__(self, recordings: Sequence[Recording], *, seed: int = 0, limits: Limits | None = None) -> None:
@@ -102,10 +103,6 @@ class ReplayCulture(ComputedCulture):
         """That of the recordings; 20 kHz if it is not known."""
         rate_hz = self._recordings[0].sampling_rate_hz
         return rate_hz if np.isfinite(rate_hz) else 20_000.0
-
-    @property
-    def recorded_as(self) -> RecordedCulture:
-        return RecordedCulture("replay")
 
     @property
     def provenance(self) -> dict[str, str]:

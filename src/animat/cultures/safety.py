@@ -1,13 +1,13 @@
-"""The guard that every stimulus passes before it is delivered to a culture."""
+"""The guard that every stimulus passes before it is delivered to a culture, and its memory of earlier ones."""
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from math import isfinite
-from typing import Final, NoReturn
+from typing import Final, NamedTuple, NoReturn
 
-from animat.cultures.history import NS, Event, History
 from animat.cultures.limits import SIMULATED_LIMITS, Limits, plain_limits
 from animat.errors import InvalidArgument, UnsafeStimulus
 from animat.stimulation.plain import seconds
@@ -15,6 +15,7 @@ from animat.stimulation.stimulus import Stimulus, plain_stimuli
 
 __all__ = ["SIMULATED_LIMITS", "Admitted", "Guard", "Limits"]
 
+NS = 1_000_000_000
 _MAY_ADMIT: Final = object()
 _PACE = frozenset({"overlap", "gap_us", "interval_us", "stimuli_per_electrode_s", "stimuli_per_s"})
 _DELAY_STEP_S = 0.001
@@ -49,6 +50,71 @@ class Admitted:
         )
 
 
+class Event(NamedTuple):
+    """A stimulus on the culture's clock."""
+
+    start_ns: int
+    end_ns: int
+    electrodes: tuple[int, ...]
+
+
+class History:
+    """The stimuli of the last second, and the last one on each electrode, in whole nanoseconds of the culture's clock.
+
+    Starts are in order of time. A guard consults it and adds what it admits. Reopening a culture continues the same
+    history, because a living culture does not forget its stimuli when a program closes it.
+    """
+
+    def __init__(self) -> None:
+        self._starts: list[int] = []
+        self._starts_on: dict[int, list[int]] = {}
+        self._seen_ns = 0
+        self.busy_until_ns = -(2**63)
+        """When the last stimulus ends; before any, too long ago for every gap."""
+
+    def in_second_to(self, time_ns: int, electrode: int | None = None) -> int:
+        """Stimuli, on one electrode or on any, that began less than a second before a time not before the last."""
+        starts = self._starts if electrode is None else self._starts_on.get(electrode, ())
+        return len(starts) - bisect_right(starts, time_ns - NS)
+
+    def last_on(self, electrode: int) -> int | None:
+        """When the last stimulus on an electrode began, however long ago; None: there was none."""
+        starts = self._starts_on.get(electrode)
+        return starts[-1] if starts else None
+
+    def add(self, events: Sequence[Event], now_ns: int) -> None:
+        """Add stimuli in order of time, and forget those more than a second old."""
+        self._seen_ns = now_ns
+        _forget(self._starts, now_ns)
+        for start_ns, end_ns, electrodes in events:
+            self._starts.append(start_ns)
+            for electrode in electrodes:
+                starts = self._starts_on.setdefault(electrode, [])
+                _forget(starts, now_ns)
+                starts.append(start_ns)
+            self.busy_until_ns = end_ns
+
+    def resume(self, now_ns: int) -> None:
+        """Continue in a new session whose clock is at `now_ns`.
+
+        A clock behind its last reading was restarted: no time is assumed to have passed. Stimuli admitted for later
+        than now were interrupted; it is not known how many were delivered, so all count as if they had begun just now.
+        Either way stimuli may seem more recent than they were, never less recent.
+        """
+        behind_ns = max(0, self._seen_ns - now_ns)
+        self._seen_ns = now_ns
+        lasts_ns = self.busy_until_ns - self._starts[-1] if self._starts else 0
+        for starts in (self._starts, *self._starts_on.values()):
+            starts[:] = [min(start_ns - behind_ns, now_ns) for start_ns in starts]
+        if self._starts:
+            self.busy_until_ns = self._starts[-1] + lasts_ns
+
+
+def _forget(starts: list[int], now_ns: int) -> None:
+    """Drop starts a second or more ago, except the last: a limit on intervals may be longer than a second."""
+    del starts[: min(bisect_right(starts, now_ns - NS), len(starts) - 1)]
+
+
 class Guard:
     """Checks every stimulus of one session against limits, and remembers what was delivered before.
 
@@ -68,24 +134,16 @@ class Guard:
         self._sites = frozenset(sites)
         self._net_charge_of = lru_cache(1000)(self.limits.check_pulse)
         self._left_on: dict[int, float] = {}
-        self._stopped: str | None = None
-        self._delivered = 0
+        self.stopped: str | None = None
+        """Why nothing more may be delivered; None: delivery is allowed."""
+        self.delivered = 0
+        """Number of stimuli admitted in this session."""
         self._history = History() if history is None else history
         self._history.resume(round(now_s * NS))
 
-    @property
-    def delivered(self) -> int:
-        """Number of stimuli admitted in this session."""
-        return self._delivered
-
-    @property
-    def stopped(self) -> str | None:
-        """Why nothing more may be delivered; None: delivery is allowed."""
-        return self._stopped
-
     def stop(self, reason: str) -> None:
         """Refuse everything from now on; the first reason passed counts."""
-        self._stopped = reason if self._stopped is None else self._stopped
+        self.stopped = reason if self.stopped is None else self.stopped
 
     def check(self, stimuli: Iterable[Stimulus], now_s: float) -> None:
         """Raise unless a request as a whole is within the limits; nothing is remembered.
@@ -103,7 +161,7 @@ class Guard:
         events, left_on = self._examine(admitted.stimuli, now_s)
         self._history.add(events, round(now_s * NS))
         self._left_on |= left_on
-        self._delivered += len(events)
+        self.delivered += len(events)
         return admitted
 
     def earliest(self, stimuli: Sequence[Stimulus], from_s: float) -> float:
@@ -126,8 +184,8 @@ class Guard:
 
     def expect_not_stopped(self) -> None:
         """Raise UnsafeStimulus after an emergency stop."""
-        if self._stopped is not None:
-            raise UnsafeStimulus("stopped", f"an emergency stop is in force ({self._stopped}): close and open again")
+        if self.stopped is not None:
+            raise UnsafeStimulus("stopped", f"an emergency stop is in force ({self.stopped}): close and open again")
 
     def _examine(self, stimuli: Sequence[Stimulus], now_s: float) -> tuple[list[Event], dict[int, float]]:
         """The stimuli on the culture's clock, and the net charge on each electrode after them."""
@@ -137,11 +195,11 @@ class Guard:
         if not isfinite(now_s):
             raise InvalidArgument(f"now_s: expected a finite time on the culture's clock, got {now_s}")
         self.expect_not_stopped()
-        if self._delivered + len(stimuli) > limits.stimuli_per_session:
+        if self.delivered + len(stimuli) > limits.stimuli_per_session:
             raise UnsafeStimulus(
                 "stimuli_per_session",
                 f"expected at most {limits.stimuli_per_session} stimuli in a session, got {len(stimuli)} more after "
-                f"{self._delivered}: request fewer, or begin a new session after a rest",
+                f"{self.delivered}: request fewer, or begin a new session after a rest",
             )
         events: list[Event] = []
         left_on: dict[int, float] = {}

@@ -252,23 +252,17 @@ def _start_s(made: Mapping[int, Path], culture: Culture, protocol: Protocol, int
 def _read_expected(file: Path, provenance: Mapping[str, str], protocol: Protocol) -> Recording:
     """Read an existing recording; raises unless it was made by this protocol of a culture with this provenance."""
     recording = read_recording(file)
-    if difference := _difference(provenance, protocol, recording):
-        raise _another(file, f"of the same culture and protocol, got another ({difference})")
+    used = "null" if recording.protocol is None else recording.protocol.to_json()
+    recorded = {**recording.provenance, "protocol": used}
+    for name, text in {**provenance, "protocol": protocol.to_json()}.items():
+        found = {name: _parsed(recorded[name])} if name in recorded else {}
+        if difference := first_difference(found, {name: _parsed(text)}):
+            raise _another(file, f"of the same culture and protocol, got another ({difference})")
     return recording
 
 
 def _another(file: Path, difference: str) -> Mismatch:
     return Mismatch(f"{file}: expected a recording {difference}: choose another folder")
-
-
-def _difference(expected: Mapping[str, str], protocol: Protocol, recording: Recording) -> str:
-    """The first setting in which a recording differs; empty if there is none."""
-    for name, text in expected.items():
-        recorded = {name: _parsed(recording.provenance[name])} if name in recording.provenance else {}
-        if difference := first_difference(recorded, {name: _parsed(text)}):
-            return difference
-    used = None if recording.protocol is None else json.loads(recording.protocol.to_json())
-    return first_difference({"protocol": used}, {"protocol": json.loads(protocol.to_json())})
 
 
 def _parsed(text: str) -> Any:

@@ -87,16 +87,15 @@ def record_traces(
     rng = np.random.default_rng([seed, 14])
     voltage_uv = _band_limited_noise(rng, samples, len(rows), rate_hz, noise_uv)
     recorded = culture.selection.recording[rows]
-    pairs = culture.visibility.pairs_of(recorded)
-    amplitude_uv = culture.visibility.amplitude_at(pairs.neuron, pairs.distance_um)
+    visibility = culture.visibility
+    pairs = visibility.pairs_of(recorded)
+    amplitude_uv = visibility.amplitude_at(pairs)
     spikes = [np.empty((0, 3))]
     for neuron in np.unique(pairs.neuron):
         seen = pairs.neuron == neuron
         at = np.rint(fired_s[fired == neuron] * rate_hz).astype(np.int64)
         at = at[at < samples]
-        shape, trough = waveform(
-            culture.visibility.trough_to_peak_ms[neuron], culture.visibility.recovery_ms[neuron], rate_hz
-        )
+        shape, trough = waveform(visibility.trough_to_peak_ms[neuron], visibility.recovery_ms[neuron], rate_hz)
         for column, size_uv in zip(pairs.electrode[seen].tolist(), amplitude_uv[seen].tolist(), strict=True):
             _add(voltage_uv[:, column], at - trough, size_uv * shape)
             spikes.append(np.column_stack(np.broadcast_arrays(at / rate_hz, column, size_uv)))

@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from animat.cultures.tissue import Tissue, TissueParameters
 
 NS = 1_000_000_000
-_STRETCH_S = 10.0
 WARM_UP_S = 5.0
 """Passes before anything is measured, as a new tissue is not yet in its steady state."""
 
@@ -60,6 +59,10 @@ class VirtualCulture(ComputedCulture):
     """
 
     name: ClassVar[str] = "virtual"
+    sampling_rate_hz = 20_000.0
+    """That of a MaxOne; spikes fall on the tissue's steps, which are four of its samples long."""
+    stretch_s = 10.0
+    """Its clock stands still between calls, and a block is the same in stretches."""
 
     def __init__(
         self,
@@ -132,11 +135,6 @@ class VirtualCulture(ComputedCulture):
     def now_s(self) -> float:
         """The culture's clock: 0 when it was first opened."""
         return (self._now_ns - self._zero_ns) / NS
-
-    @property
-    def sampling_rate_hz(self) -> float:
-        """That of a MaxOne; spikes fall on the tissue's steps, which are four of its samples long."""
-        return 20_000.0
 
     @property
     def provenance(self) -> dict[str, str]:
@@ -251,11 +249,6 @@ class VirtualCulture(ComputedCulture):
         self._is_seen = np.arange(self._n_seen_by.max(initial=0)) < self._n_seen_by[:, None]
         self._seen_by = np.zeros(self._is_seen.shape, dtype=np.int64)
         self._seen_by[self._is_seen] = pairs.electrode[order]
-
-    @property
-    def stretch_s(self) -> float:
-        """Its clock stands still between calls, and a block is the same in stretches."""
-        return _STRETCH_S
 
     def _deliver(self, admitted: Admitted, duration_s: float) -> Observed:
         start_ns, tissue = self._now_ns, self.tissue

@@ -61,11 +61,9 @@ class Visibility:
         pair = np.repeat(first, counts) + np.arange(len(row)) - np.repeat(np.cumsum(counts) - counts, counts)
         return Pairs(row, self.pairs.neuron[pair], self.pairs.distance_um[pair])
 
-    def amplitude_at(
-        self, neuron: Int64[np.ndarray, " pairs"], distance_um: Float64[np.ndarray, " pairs"]
-    ) -> Float64[np.ndarray, " pairs"]:
-        """Amplitude of a neuron's spike at a distance, in uV."""
-        return np.asarray(self.amplitude_uv[neuron] / (1 + (distance_um / HALF_UM) ** 2))
+    def amplitude_at(self, pairs: Pairs) -> Float64[np.ndarray, " pairs"]:
+        """Amplitude of a neuron's spike on an electrode, in uV."""
+        return np.asarray(self.amplitude_uv[pairs.neuron] / (1 + (pairs.distance_um / HALF_UM) ** 2))
 
     def measure(
         self,
@@ -78,7 +76,7 @@ class Visibility:
         pairs, rows = self.pairs_of(electrodes), len(electrodes)
         weight = spikes_of[pairs.neuron].astype(np.float64)
         count = np.bincount(pairs.electrode, weight, rows)
-        amplitude_uv = self.amplitude_at(pairs.neuron, pairs.distance_um)
+        amplitude_uv = self.amplitude_at(pairs)
 
         def mean(of: Float64[np.ndarray, " pairs"]) -> Float64[np.ndarray, " electrodes"]:
             total = np.bincount(pairs.electrode, weight * of, rows)

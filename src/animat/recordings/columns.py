@@ -11,9 +11,9 @@ from jaxtyping import Float64, Int64
 
 from animat.errors import UnusableData
 from animat.recordings.findings import Finding, merged
-from animat.recordings.gaps import late_start
 from animat.recordings.metadata import culture_of
 from animat.recordings.recording import Channels, Recording
+from animat.recordings.time_quality import late_start
 from animat.stimulation.protocol import Presentation
 from animat.stimulation.stimulus import NOTHING, Stimuli
 from animat.tables import UNKNOWN, expect_times
@@ -50,11 +50,7 @@ class PlainColumns:
     presentation_pulses: int | None = None
 
     def to_recording(self, provenance: Mapping[str, str], findings: tuple[Finding, ...] = ()) -> Recording:
-        """Check and sort the columns and make a recording from them; findings so far are kept in it.
-
-        Raises:
-            UnusableData: naming the column, what was expected and what came.
-        """
+        """Check and sort the columns and make a recording from them, with the findings so far."""
         for name in ("spike_channel", "channel_label", "stimulus_pattern"):
             dtype = np.asarray(getattr(self, name)).dtype
             # Characters for which every row of a text column has room.
@@ -143,9 +139,7 @@ class PlainColumns:
             )
         return table, values.astype(np.int64)
 
-    def _stimuli(
-        self, time_s: Float64[np.ndarray, " stimuli"], in_time: Int64[np.ndarray, " stimuli"], noted: list[Finding]
-    ) -> tuple[Stimuli, dict[str, str]]:
+    def _stimuli(self, time_s: Column, in_time: Column, noted: list[Finding]) -> tuple[Stimuli, dict[str, str]]:
         """The stimulus table, and the patterns' names for the provenance."""
         n = len(time_s)
         frequency_hz, pattern, names = np.full(n, np.nan), np.full(n, UNKNOWN), dict[str, str]()
@@ -179,12 +173,10 @@ class PlainColumns:
         _expect_electrodes("stimulus_electrodes", whole, expected)
         return whole
 
-    def _presentations(
-        self, n: int, in_time: Int64[np.ndarray, " stimuli"], noted: list[Finding]
-    ) -> Int64[np.ndarray, " stimuli"]:
+    def _presentations(self, n: int, in_time: Column, noted: list[Finding]) -> Column:
         if self.stimulus_presentation is not None:
             column = _column("stimulus_presentation", self.stimulus_presentation, n)
-            presentations: Int64[np.ndarray, " stimuli"] = _whole("stimulus_presentation", column)[in_time]
+            presentations: Column = _whole("stimulus_presentation", column)[in_time]
             unknown = presentations == UNKNOWN
             # `Stimuli` refuses numbers that fall.
             if not np.any(unknown) or np.any(np.diff(presentations[~unknown]) < 0):
@@ -213,11 +205,7 @@ def columns_of(recording: Recording) -> dict[str, Any]:
 
 
 def with_start(recording: Recording, start_s: float) -> Recording:
-    """The recording with a new start, reported as a finding if it differs, and the same end.
-
-    Raises:
-        UnusableData: if events come before the new start.
-    """
+    """The recording with a new start, reported as a finding if it differs, and the same end; refuses earlier events."""
     duration_s = duration_between(start_s, max(recording.stop_s, start_s))
     is_same = start_s == recording.start_s
     outdated = ("start-unknown",) if is_same else ("start-unknown", "start-given")
@@ -245,9 +233,7 @@ def recorded_span(frames: int, rate_hz: float, *times_s: Column) -> dict[str, fl
     return {"start_s": start_s, "duration_s": stop_s - start_s}
 
 
-def _in_time(
-    name: str, column: Column, events: str, noted: list[Finding]
-) -> tuple[Float64[np.ndarray, " events"], Int64[np.ndarray, " events"]]:
+def _in_time(name: str, column: Column, events: str, noted: list[Finding]) -> tuple[Column, Column]:
     """The sorted times and the (stable) order that sorts them; reports times that were out of order."""
     times_s = _numbers(name, np.asarray(column))
     if times_s.ndim != 1:

@@ -15,8 +15,8 @@ from animat.errors import InvalidArgument, InvalidFile
 from animat.progress import Progress
 from animat.recordings.detection.settings import Detection
 from animat.recordings.findings import Finding, merged
+from animat.recordings.formats.hdf5_formats import open_traces
 from animat.recordings.formats.nwb import write_nwb
-from animat.recordings.formats.traces import open_traces
 from animat.recordings.formats.with_spikeinterface import open_with_spikeinterface
 from animat.recordings.metadata import culture_of
 from animat.recordings.raw import RawTraces

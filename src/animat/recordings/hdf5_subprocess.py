@@ -32,11 +32,7 @@ _reader: Process | None = None
 
 
 def read_hdf5_in_subprocess(path: Path, *, part: str | None = None, stimuli: str | None = None) -> Recording:
-    """Read a recording as `animat.recordings.formats.hdf5_formats.read_hdf5` does, in the separate process.
-
-    Raises:
-        InvalidFile: also if the HDF5 library crashes on the file, or exceeds its limits on time or memory.
-    """
+    """As `read_hdf5`, in the separate process; also InvalidFile if the library crashes or exceeds its limits."""
     # Messages name the path as it was given, so the folder that it is relative to is passed too.
     call = pickle.dumps((_read, (Path.cwd(), path, part, stimuli), {}))
     wait_s = WAIT_S + WAIT_S_PER_MB * path.stat().st_size / 1e6

@@ -19,11 +19,7 @@ _VALUES = "values of findings"
 
 
 def to_metadata(recording: Recording) -> dict[str, str]:
-    """The provenance, and the fields that `from_metadata` restores.
-
-    Raises:
-        InvalidArgument: for a provenance that would be read back as something else.
-    """
+    """The provenance, and the fields that `from_metadata` restores; refuses what would be read back as another."""
     metadata = dict(recording.provenance)
     if reserved := [key for key in metadata if key in ("protocol", _VALUES) or _is_finding(key)]:
         raise InvalidArgument(f"provenance: expected no key of a file's protocol or findings, got {reserved[0]!r}")
@@ -38,11 +34,7 @@ def to_metadata(recording: Recording) -> dict[str, str]:
 
 
 def from_metadata(metadata: Mapping[str, str]) -> dict[str, Any]:
-    """A recording's `provenance`, `protocol`, `culture` and `findings`.
-
-    Raises:
-        InvalidArgument: for a protocol that is not one, or values that are no numbers.
-    """
+    """A recording's `provenance`, `protocol`, `culture` and `findings`; refuses what is no protocol or no number."""
     provenance, findings, protocol = dict[str, str](), list[Finding](), None
     values = read_record(dict[str, float], json_data(metadata.get(_VALUES, "{}"), _VALUES), _VALUES)
     for key, text in metadata.items():

@@ -8,10 +8,8 @@ import numpy as np
 
 from animat.errors import some_of
 from animat.recordings.findings import Finding
-from animat.recordings.gaps import silences
-from animat.recordings.recording import Recording
-from animat.recordings.response_table import ResponseTable
-from animat.recordings.time_quality import frequency_findings, time_findings
+from animat.recordings.recording import Recording, ResponseTable
+from animat.recordings.time_quality import frequency_findings, silences, time_findings
 from animat.stimulation.frequency import is_same
 from animat.tables import UNKNOWN
 

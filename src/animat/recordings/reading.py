@@ -18,16 +18,10 @@ from animat.recordings.columns import with_start
 from animat.recordings.formats.csv import read_csv
 from animat.recordings.formats.hdf5 import DAMAGE
 from animat.recordings.formats.npz import read_npz
-from animat.recordings.formats.response_files import (
-    is_response_npz,
-    is_response_table,
-    read_response_npz,
-    read_response_table,
-)
-from animat.recordings.formats.text_table import GZIP, read_text_table
+from animat.recordings.formats.response_files import read_response_npz, read_response_table
+from animat.recordings.formats.text_table import GZIP, read_table
 from animat.recordings.hdf5_subprocess import read_hdf5_in_subprocess
-from animat.recordings.recording import Recording
-from animat.recordings.response_table import ResponseTable
+from animat.recordings.recording import Recording, ResponseTable
 
 S = TypeVar("S", Recording, Recording | ResponseTable)
 
@@ -116,7 +110,7 @@ def read_source(
             if begin.startswith(HDF5):
                 return read_hdf5_in_subprocess(path, part=part, stimuli=stimuli)
             if begin.startswith(ZIP):
-                return read_response_npz(path) if is_response_npz(path) else read_npz(path)
+                return read_response_npz(path) or read_npz(path)
             return _read_text(path, begin, stimuli_path)
     except (*DAMAGE, RecursionError, AssertionError) as error:
         # Errors that no reader anticipated: report them in one line too.
@@ -132,8 +126,8 @@ def _read_text(path: Path, begin: bytes, stimuli_path: str | os.PathLike[str] | 
         kind = known or "an unknown kind of file"
         raise InvalidFile(f"{path}: expected a recording (NWB, MaxWell, CL1, NPZ or CSV), got {kind}")
     try:
-        table = read_text_table(path)
-        return read_response_table(table) if is_response_table(table) else read_csv(table, stimuli_path)
+        table = read_table(path)
+        return read_response_table(table) or read_csv(table, stimuli_path)
     except InvalidFile as error:
         if not has_hdf5_name or stimuli_path is not None:
             raise

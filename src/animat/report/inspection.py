@@ -10,8 +10,7 @@ from pathlib import Path
 from animat.errors import InvalidArgument, Mismatch, counted
 from animat.lazy import Figure
 from animat.recordings.findings import Finding
-from animat.recordings.recording import Recording
-from animat.recordings.response_table import ResponseTable
+from animat.recordings.recording import Recording, ResponseTable
 from animat.report.array import draw_array
 from animat.report.drift import draw_drift
 from animat.report.response_histograms import draw_burst_separation, draw_response_histograms, draw_responses_over_time

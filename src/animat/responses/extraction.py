@@ -11,8 +11,7 @@ from animat.arguments import checked_arguments
 from animat.errors import InvalidArgument, Mismatch, UnusableData, in_min
 from animat.recordings.findings import Finding
 from animat.recordings.quality import recording_findings
-from animat.recordings.recording import Recording
-from animat.recordings.response_table import ResponseTable
+from animat.recordings.recording import Recording, ResponseTable
 from animat.responses.bursts import separate_bursts
 from animat.responses.conditions import NO_CONDITION, ByInterval, Conditions, conditions_named, default_conditions
 from animat.responses.quality.one_culture import series_findings

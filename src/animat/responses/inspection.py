@@ -11,8 +11,7 @@ import numpy as np
 from animat.arguments import checked_arguments
 from animat.recordings.findings import Finding
 from animat.recordings.quality import recording_findings
-from animat.recordings.recording import Recording
-from animat.recordings.response_table import ResponseTable
+from animat.recordings.recording import Recording, ResponseTable
 from animat.recordings.time_quality import TIME_UNITS
 from animat.records import as_json
 from animat.responses.bursts import NetworkBursts, find_network_bursts

@@ -15,10 +15,9 @@ from jaxtyping import Int64
 from animat.cultures.base import Culture
 from animat.cultures.devices.cl1_delivery import FRAMES_PER_S, LEAD_US, Session
 from animat.cultures.failures import as_device_failure, describe_error, vendor_module, while_open
-from animat.cultures.history import History
 from animat.cultures.holding import of_the_machine, of_the_program
 from animat.cultures.observed import Observed, Spikes
-from animat.cultures.safety import Admitted, Guard, Limits
+from animat.cultures.safety import Admitted, Guard, History, Limits
 from animat.errors import AnimatError, DeviceFailed, InvalidArgument
 from animat.extras import install_command
 from animat.recordings.formats.cl1_layout import CHANNELS, IDENTIFIERS, NO_STIMULATION, SITES, STIMULUS_STREAM
@@ -80,6 +79,7 @@ class CL1Culture(Culture):
     """
 
     name: ClassVar[str] = "cl1"
+    sampling_rate_hz = float(FRAMES_PER_S)
 
     def __init__(
         self,
@@ -144,10 +144,6 @@ class CL1Culture(Culture):
         """The device's clock, which starts with the device, not when it is opened."""
         with as_device_failure("CL1", "report its time"):
             return float(while_open(self._session).neurons.timestamp() / FRAMES_PER_S)
-
-    @property
-    def sampling_rate_hz(self) -> float:
-        return float(FRAMES_PER_S)
 
     @property
     def recorded_as(self) -> RecordedCulture:

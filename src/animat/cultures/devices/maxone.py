@@ -15,14 +15,12 @@ import numpy as np
 from jaxtyping import Int64
 
 from animat.cultures.base import Culture
-from animat.cultures.devices.maxone_sequences import FRAMES_PER_S, INITIAL_DELAY, SAMPLE_US, Sequences
+from animat.cultures.devices.maxone_commands import FRAMES_PER_S, INITIAL_DELAY, SAMPLE_US, Sequences, Wiring, wire
 from animat.cultures.devices.maxone_stream import AMPLIFIERS, SpikeStream, ZmqSpikes
-from animat.cultures.devices.maxone_wiring import Wiring, wire
 from animat.cultures.failures import as_device_failure, describe_error, once_opened, vendor_module, while_open
-from animat.cultures.history import History
 from animat.cultures.holding import of_the_machine
 from animat.cultures.observed import Observed, observed_in_frames
-from animat.cultures.safety import Admitted, Guard, Limits
+from animat.cultures.safety import Admitted, Guard, History, Limits
 from animat.errors import DeviceFailed, InvalidArgument
 from animat.recordings.recorded_culture import RecordedCulture
 from animat.recordings.recording import Channels
@@ -78,6 +76,8 @@ class MaxOneCulture(Culture):
     """
 
     name: ClassVar[str] = "maxone"
+    sampling_rate_hz = float(FRAMES_PER_S)
+    recorded_as = RecordedCulture("maxone")
 
     def __init__(
         self,
@@ -149,14 +149,6 @@ class MaxOneCulture(Culture):
     def now_s(self) -> float:
         """Time since it was first opened, by the newest frame received."""
         return (while_open(self._stream).frame() - self._zero_frame) / FRAMES_PER_S
-
-    @property
-    def sampling_rate_hz(self) -> float:
-        return float(FRAMES_PER_S)
-
-    @property
-    def recorded_as(self) -> RecordedCulture:
-        return RecordedCulture("maxone")
 
     @property
     def provenance(self) -> dict[str, str]:

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64, UInt64
 
 from animat.cultures.tissue.kernel import AXONAL_KICK_MV, axonal_draws
-from animat.cultures.tissue.network import Network
+from animat.cultures.tissue.network import Network, Neurons
 from animat.cultures.tissue.parameters import TissueParameters
 from animat.errors import InvalidArgument
 
@@ -19,6 +19,9 @@ SMALLEST_KICK_MV = 0.5
 """Smaller kicks are left out: they are negligible next to the noise."""
 LARGEST_STRENGTH = 2.0
 """Pulses up to twice the full strength are modelled."""
+
+Place = tuple[int, int]
+"""A position (x, y) in tenths of a micrometre."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,8 +103,6 @@ class Coupling:
         drawn as functions of the pulse's step: they do not depend on how time is divided.
         """
         parameters = self._parameters
-        if len(pulse.x_um) == 0:
-            return NO_KICKS
         reach = self.reach(pulse.x_um, pulse.y_um)
         draw, jitter = axonal_draws(reach.axon_key, pulse_step)
         passes = (draw < parameters.axon_reliability) & (reach.axon_rank < pulse.strength)
@@ -114,17 +115,12 @@ class Coupling:
         )
 
 
-def _join_reaches(reach_of_one: Callable[[tuple[int, int]], Reach], places: tuple[tuple[int, int], ...]) -> Reach:
+def _join_reaches(reach_of_one: Callable[[Place], Reach], places: tuple[Place, ...]) -> Reach:
     return Reach(*(np.concatenate(columns) for columns in zip(*map(reach_of_one, places), strict=True)))
 
 
 def _find_reach(
-    seed: int,
-    parameters: TissueParameters,
-    network: Network,
-    kick_factor: Float64[np.ndarray, " neurons"],
-    own_latency_ms: Float64[np.ndarray, " neurons"],
-    place: tuple[int, int],
+    seed: int, parameters: TissueParameters, network: Network, kick_factor: Neurons, latency_ms: Neurons, place: Place
 ) -> Reach:
     distance_um = np.hypot(network.x_um - place[0] / 10, network.y_um - place[1] / 10)
     kick_mv = parameters.kick_mv * kick_factor / (1 + (distance_um / parameters.kick_reach_um) ** 2)
@@ -135,7 +131,7 @@ def _find_reach(
     rank = rng.uniform(size=len(network)) / chance
     key = rng.integers(0, 2**64, len(network), dtype=np.uint64)
     axons = np.flatnonzero(rank < LARGEST_STRENGTH)
-    latency_ms = parameters.axon_latency_ms + own_latency_ms + distance_um / parameters.conduction_um_per_ms
+    latency_ms = parameters.axon_latency_ms + latency_ms + distance_um / parameters.conduction_um_per_ms
     return Reach(near, kick_mv[near], axons, rank[axons], latency_ms[axons], key[axons])
 
 

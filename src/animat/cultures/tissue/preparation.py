@@ -62,10 +62,8 @@ def prepare_constants(parameters: TissueParameters) -> Shaped[np.ndarray, " 1"]:
         "conduction_s": parameters.conduction_min * 60,
     }
     values = {name: np.asarray(value) for name, value in constants.items()}
-    record = np.zeros(1, np.dtype([(name, value.dtype, value.shape) for name, value in values.items()], align=True))
-    for name, value in values.items():
-        record[name] = value
-    return record
+    fields = [(name, value.dtype, value.shape) for name, value in values.items()]
+    return np.array([tuple(values.values())], np.dtype(fields, align=True))
 
 
 def nmda_block(v_mv: Float64[np.ndarray, " potentials"]) -> Float64[np.ndarray, " potentials"]:

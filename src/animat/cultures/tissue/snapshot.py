@@ -72,9 +72,8 @@ def expect_array(
 ) -> None:
     """Refuse an array of another type or shape, or with values, NaN among them, outside a range."""
     if values.dtype != dtype or values.shape != shape:
-        raise InvalidArgument(
-            f"{name}: expected {np.dtype(dtype)} of shape {shape}, got {values.dtype} of shape {values.shape}"
-        )
+        expected = f"{np.dtype(dtype)} of shape {shape}"
+        raise InvalidArgument(f"{name}: expected {expected}, got {values.dtype} of shape {values.shape}")
     low, high = within
     outside = ~((values >= low) & (values <= high))
     if outside.any():

@@ -11,7 +11,6 @@ from jaxtyping import Float64, Int64
 
 from animat.cultures.tissue import kernel
 from animat.cultures.tissue.coupling import NO_KICKS, Coupling, Kicks, Pulse, in_order
-from animat.cultures.tissue.drift import MARK_S, Drift
 from animat.cultures.tissue.kernel import State
 from animat.cultures.tissue.network import grow
 from animat.cultures.tissue.parameters import TissueParameters
@@ -20,6 +19,8 @@ from animat.cultures.tissue.snapshot import Snapshot, expect_sound
 from animat.errors import InvalidArgument, Mismatch, expect_at_least
 
 NS = 1_000_000_000
+MARK_S = 10
+"""The drift is constant between marks of the tissue's clock, so it does not depend on how time is divided."""
 
 
 class Spikes(NamedTuple):
@@ -30,6 +31,23 @@ class Spikes(NamedTuple):
 
 
 NO_SPIKES = Spikes(np.empty(0), np.empty(0, np.int64))
+
+
+class Drift:
+    """The slow drift of excitation: g(t) = 1 + o(t), with o an Ornstein-Uhlenbeck process that starts at 0."""
+
+    def __init__(self, seed: int, parameters: TissueParameters) -> None:
+        self._draws = np.random.default_rng([seed, 2])
+        self._kept = float(np.exp(-MARK_S / (60 * parameters.drift_min)))
+        self._spread = parameters.drift_share * float(np.sqrt(1 - self._kept**2))
+        self._drifts = [0.0]
+
+    def gain(self, mark: int) -> float:
+        """The factor on all excitatory weights from `mark` to the next, `MARK_S` later."""
+        # One draw per mark, in order: the drift is the same function of time, however time is divided.
+        for draw in self._draws.standard_normal(max(0, mark + 1 - len(self._drifts))).tolist():
+            self._drifts.append(self._drifts[-1] * self._kept + self._spread * draw)
+        return max(0.0, 1 + self._drifts[mark])
 
 
 class Tissue:
@@ -45,9 +63,6 @@ class Tissue:
         x_um, y_um: position of each neuron along the array's long and short side, shape (neurons,).
         is_excitatory: type of each neuron, shape (neurons,).
         step_ns: the time step.
-
-    Raises:
-        InvalidArgument: for a negative seed.
     """
 
     def __init__(self, seed: int, parameters: TissueParameters | None = None) -> None:
@@ -80,10 +95,7 @@ class Tissue:
         12.5 ms is the same as in one. A pulse acts at the first step that does not begin before it.
 
         Args:
-            pulses: with times in [now_s, now_s + duration_s), in any order.
-
-        Raises:
-            InvalidArgument: for a negative duration, or a pulse outside this stretch of time; no time has then passed.
+            pulses: with times in [now_s, now_s + duration_s), in any order; for any other no time passes.
         """
         end_ns = self._now_ns + _nanoseconds(duration_s)
         if pulses:
@@ -117,12 +129,7 @@ class Tissue:
         return Snapshot(self.seed, self.parameters, self._now_ns, self._step, self._kicks, state)
 
     def restore(self, snapshot: Snapshot) -> None:
-        """Return to a snapshot; from there the tissue continues bit for bit as it did after it.
-
-        Raises:
-            Mismatch: for a snapshot of another seed or other parameters.
-            InvalidArgument: for a state that no tissue can reach; nothing has then changed.
-        """
+        """Return to a snapshot, from which the tissue continues bit for bit; refuses a state that it cannot reach."""
         if (snapshot.seed, snapshot.parameters) != (self.seed, self.parameters):
             raise Mismatch(
                 f"snapshot: expected one of this tissue (seed {self.seed}), got one of seed {snapshot.seed} or with "

@@ -22,6 +22,13 @@ SETTLE_MS = 0.25
 PAUSE_MS = 1.0
 """How long the trace of an amplifier that has been saturated for more than `recovery_ms` may move in between."""
 
+Traces = Float32[np.ndarray, "channels samples"]
+Flags = Bool[np.ndarray, "channels samples"]
+Levels = Float32[np.ndarray, " channels"]
+Counts = Int64[np.ndarray, " channels"]
+Pulses = Int64[np.ndarray, " stimuli"]
+"""Voltages, or something else of each sample; a voltage or a number of each channel; a number of each pulse."""
+
 
 @dataclass(frozen=True, eq=False)
 class Cleaned:
@@ -30,19 +37,19 @@ class Cleaned:
     After each stimulus in it, `saturated` channels are saturated, the last of which is blanked for `longest_ms`.
     """
 
-    voltage_uv: Float32[np.ndarray, "channels samples"]
-    is_blank: Bool[np.ndarray, "channels samples"]
-    saturated: Int64[np.ndarray, " stimuli"]
+    voltage_uv: Traces
+    is_blank: Flags
+    saturated: Pulses
     longest_ms: Float32[np.ndarray, " stimuli"]
 
 
 def without_artefacts(
-    voltage_uv: Float32[np.ndarray, "channels samples"],
-    stimulus: Int64[np.ndarray, " stimuli"],
-    noise_uv: Float32[np.ndarray, " channels"],
+    voltage_uv: Traces,
+    stimulus: Pulses,
+    noise_uv: Levels,
     rate_hz: float,
     settings: Detection,
-    rest_uv: Float32[np.ndarray, " channels"] | None = None,
+    rest_uv: Levels | None = None,
 ) -> Cleaned:
     """Remove artefacts from a stretch of traces, in place.
 
@@ -107,12 +114,8 @@ def without_artefacts(
 
 
 def _saturated_until(
-    trace_uv: Float32[np.ndarray, "channels samples"],
-    noise_uv: Float32[np.ndarray, " channels"],
-    settings: Detection,
-    flat: int,
-    pause: int | None = None,
-) -> Int64[np.ndarray, " channels"]:
+    trace_uv: Traces, noise_uv: Levels, settings: Detection, flat: int, pause: int | None = None
+) -> Counts:
     """The number of samples until each channel's amplifier has recovered from saturation.
 
     If its rail is not known, it is saturated where `flat` samples in a row are far from rest and hardly differ: the
@@ -142,11 +145,7 @@ def _saturated_until(
 
 
 def _blank(
-    voltage_uv: Float32[np.ndarray, "channels samples"],
-    is_blank: Bool[np.ndarray, "channels samples"],
-    start: int,
-    until: Int64[np.ndarray, " channels"],
-    is_held: Bool[np.ndarray, " channels"],
+    voltage_uv: Traces, is_blank: Flags, start: int, until: Counts, is_held: Bool[np.ndarray, " channels"]
 ) -> None:
     """Draw a straight line over the blanked stretch of each channel, between the means of ten samples on either side.
 
@@ -163,12 +162,7 @@ def _blank(
 
 
 def _subtract_recovery(
-    voltage_uv: Float32[np.ndarray, "channels samples"],
-    until: Int64[np.ndarray, " channels"],
-    stops: Int64[np.ndarray, " channels"],
-    rest_uv: Float32[np.ndarray, " channels"],
-    noise_uv: Float32[np.ndarray, " channels"],
-    per_ms: float,
+    voltage_uv: Traces, until: Counts, stops: Counts, rest_uv: Levels, noise_uv: Levels, per_ms: float
 ) -> None:
     """Fit a exp(-t / tau) + b to the trace of each unsettled channel after blanking, and subtract the exponential."""
     for start, stop in np.unique(np.column_stack([until, stops]), axis=0).tolist():

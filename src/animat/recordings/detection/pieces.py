@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int64
+from jaxtyping import Bool, Float32
 
-from animat.recordings.detection.artefacts import Cleaned, without_artefacts
+from animat.recordings.detection.artefacts import Cleaned, Levels, Pulses, without_artefacts
 from animat.recordings.detection.settings import Detection
 from animat.recordings.raw import RawTraces
 
@@ -34,23 +34,12 @@ class Piece:
     lead: int
     voltage_uv: Float32[np.ndarray, "samples channels"]
     is_lost: Bool[np.ndarray, "samples channels"] | None
-    stimulus: Int64[np.ndarray, " stimuli"]
+    stimulus: Pulses
     first_stimulus: int
     rests_uv: Float32[np.ndarray, "pulses channels"] | None
 
-    @property
-    def owned(self) -> np.ndarray:
-        """Which of its stimuli lie between `start` and `stop`, not in a margin."""
-        at = self.stimulus - self.lead - self.margin
-        return np.asarray((at >= 0) & (at < self.stop - self.start))
-
     def cleaned(
-        self,
-        columns: slice,
-        noise_uv: Float32[np.ndarray, " channels"],
-        level_uv: Float32[np.ndarray, " channels"],
-        rate_hz: float,
-        settings: Detection,
+        self, columns: slice, noise_uv: Levels, level_uv: Levels, rate_hz: float, settings: Detection
     ) -> Cleaned:
         """Some of the channels, one per row, without artefacts and without the lead; lost samples are blank.
 
@@ -71,20 +60,8 @@ class Piece:
             is_blank=is_blank[:, self.lead :],
         )
 
-    def rows(self, columns: slice) -> Float32[np.ndarray, "channels samples"]:
-        """Some of the channels as recorded, one per row and without the lead."""
-        return np.ascontiguousarray(self.voltage_uv[self.lead :, columns].T)
 
-    @property
-    def lost(self) -> Int64[np.ndarray, " channels"]:
-        """The number of samples of each channel between `start` and `stop` that are not finite."""
-        first = self.lead + self.margin
-        if self.is_lost is None:
-            return np.zeros(self.voltage_uv.shape[1], np.int64)
-        return np.asarray(np.count_nonzero(self.is_lost[first : first + self.stop - self.start], axis=0))
-
-
-def read_piece(traces: RawTraces, stimulus: Int64[np.ndarray, " stimuli"], start: int, stop: int, margin: int) -> Piece:
+def read_piece(traces: RawTraces, stimulus: Pulses, start: int, stop: int, margin: int) -> Piece:
     """Read a piece, with a lead if there was a pulse in the second before.
 
     An amplifier may be saturated since an even earlier pulse, so resting voltages are read before some of these.
@@ -116,9 +93,7 @@ def read_piece(traces: RawTraces, stimulus: Int64[np.ndarray, " stimuli"], start
     return Piece(start, stop, margin, start - margin - begin, voltage_uv, is_lost, inside, first_stimulus, rests_uv)
 
 
-def _rests_uv(
-    traces: RawTraces, stimulus: Int64[np.ndarray, " stimuli"], rest: int
-) -> Float32[np.ndarray, "pulses channels"] | None:
+def _rests_uv(traces: RawTraces, stimulus: Pulses, rest: int) -> Float32[np.ndarray, "pulses channels"] | None:
     """The voltage of each channel before a few of these pulses, evenly chosen; None if there are none."""
     chosen = stimulus[np.linspace(0, len(stimulus) - 1, min(len(stimulus), REST_PULSES)).astype(int)]
     before = [traces.read_uv(at - rest, at - rest // 2) for at in chosen.tolist() if at >= rest]

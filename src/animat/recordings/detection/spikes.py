@@ -1,28 +1,39 @@
-"""Detects spikes in raw traces: first the noise, then piece by piece on all cores, in bounded memory."""
+"""Detects spikes in raw traces as negative peaks, piece by piece on all cores, in bounded memory."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
+from scipy import fft, signal
 
 from animat.errors import InvalidArgument
 from animat.process import own_cores
 from animat.progress import Progress, Silent
-from animat.recordings.detection.band import MARGIN_S, band_pass
-from animat.recordings.detection.negative_peaks import find_negative_peaks, median_noise_uv
+from animat.recordings.detection.artefacts import Counts, Flags, Levels, Pulses, Traces
 from animat.recordings.detection.pieces import Piece, read_piece
 from animat.recordings.detection.settings import Detection
 from animat.recordings.findings import Finding
 from animat.recordings.raw import RawTraces
 
+ORDER = 3
+MARGIN_S = 0.05
+"""Margin that a piece needs on both sides: the filter's transform is circular, and the resulting transient at its ends
+decays by e in 3 ms at 100 Hz."""
 BLOCK = 64
 """Channels filtered at a time: few enough to fit into the processor's cache."""
 NOISE_PIECES, NOISE_PIECE_S = 15, 0.2
+NOISE_SAMPLES = 2500
+"""Approximate number of samples used per channel."""
+NORMAL = 0.6745
+"""Ratio of the median of |x| to the standard deviation of x for a normal distribution."""
+LEAST_SHARE = 0.1
+"""Share of a channel's samples from which its noise can be estimated."""
 LEVEL_STEP = 20
 """Every so many samples are enough for the median of the voltage."""
 DEAD, NOISY = 0.1, 5.0
@@ -32,17 +43,11 @@ MUCH_LOST = 0.01
 
 @dataclass(frozen=True, eq=False)
 class DetectedSpikes:
-    """Detected spikes, in order of time.
-
-    Attributes:
-        time_s: of their negative peaks, on the recording's clock, shape (spikes,).
-        channel: row of the channel table, shape (spikes,).
-        noise_uv: standard deviation of each channel's noise, shape (channels,).
-    """
+    """Spikes in order of time (that of their negative peaks) by row of the channel table, and each channel's noise."""
 
     time_s: Float64[np.ndarray, " spikes"]
     channel: Int64[np.ndarray, " spikes"]
-    noise_uv: Float32[np.ndarray, " channels"]
+    noise_uv: Levels
     findings: tuple[Finding, ...]
 
 
@@ -109,19 +114,18 @@ def detect_spikes(
     )
 
 
-def is_dead(noise_uv: Float32[np.ndarray, " channels"]) -> np.ndarray:
+def is_dead(noise_uv: Levels) -> np.ndarray:
     """Whether a channel has hardly any noise, so that no signal reaches it; shape (channels,)."""
     return np.asarray(noise_uv <= DEAD * np.median(noise_uv)) if len(noise_uv) else np.zeros(0, dtype=bool)
 
 
 def blocks(channels: int) -> Iterator[slice]:
     """The columns in blocks."""
-    for first in range(0, channels, BLOCK):
-        yield slice(first, min(first + BLOCK, channels))
+    return (slice(first, first + BLOCK) for first in range(0, channels, BLOCK))
 
 
 def _noise_and_level_uv(
-    traces: RawTraces, stimulus: Int64[np.ndarray, " stimuli"], settings: Detection, workers: int
+    traces: RawTraces, stimulus: Pulses, settings: Detection, workers: int
 ) -> Float32[np.ndarray, "2 channels"]:
     """The noise of each channel and its usual voltage: medians over pieces spread over the recording."""
     rate_hz, channels = traces.sampling_rate_hz, len(traces.channels)
@@ -133,12 +137,12 @@ def _noise_and_level_uv(
         medians_uv = np.zeros((2, channels), np.float32)
         piece = read_piece(traces, stimulus, start, min(start + length, traces.samples), margin)
         for columns in blocks(channels):
-            rows = piece.rows(columns)
+            rows = np.ascontiguousarray(piece.voltage_uv[piece.lead :, columns].T)
             level_uv = np.median(rows[:, ::LEVEL_STEP], axis=1)
-            first = median_noise_uv(_filtered(rows, settings, rate_hz)[:, margin:-margin])
+            first = median_noise_uv(band_pass(rows, settings.band_hz, rate_hz)[:, margin:-margin])
             if len(piece.stimulus) or piece.is_lost is not None:
                 cleaned = piece.cleaned(columns, first, level_uv, rate_hz, settings)
-                filtered = _filtered(cleaned.voltage_uv, settings, rate_hz)
+                filtered = band_pass(cleaned.voltage_uv, settings.band_hz, rate_hz)
                 first = median_noise_uv(filtered[:, margin:-margin], cleaned.is_blank[:, margin:-margin])
             medians_uv[:, columns] = first, level_uv
         return medians_uv
@@ -157,43 +161,104 @@ class _Found(NamedTuple):
     channel: Int64[np.ndarray, " spikes"]
     first_stimulus: int
     saturation: Float64[np.ndarray, "stimuli 2"]
-    lost: Int64[np.ndarray, " channels"]
+    lost: Counts
 
 
-def _search(
-    piece: Piece,
-    noise_uv: Float32[np.ndarray, " channels"],
-    level_uv: Float32[np.ndarray, " channels"],
-    rate_hz: float,
-    settings: Detection,
-) -> _Found:
+def _search(piece: Piece, noise_uv: Levels, level_uv: Levels, rate_hz: float, settings: Detection) -> _Found:
     depth_uv = np.where(is_dead(noise_uv), np.inf, settings.threshold * noise_uv).astype(np.float32)
     apart = max(round(settings.dead_time_ms * 1e-3 * rate_hz), 1)
     first, last = piece.margin, piece.margin + piece.stop - piece.start
+    is_owned = (piece.stimulus >= piece.lead + first) & (piece.stimulus < piece.lead + last)
+    lost = np.zeros(len(noise_uv), np.int64)
+    if piece.is_lost is not None:
+        lost = np.count_nonzero(piece.is_lost[piece.lead + first : piece.lead + last], axis=0)
     samples, channels, saturation = [], [], np.zeros((len(piece.stimulus), 2))
     for columns in blocks(len(noise_uv)):
         cleaned = piece.cleaned(columns, noise_uv[columns], level_uv[columns], rate_hz, settings)
-        filtered = _filtered(cleaned.voltage_uv, settings, rate_hz)
+        filtered = band_pass(cleaned.voltage_uv, settings.band_hz, rate_hz)
         if cleaned.is_blank.any():
             filtered[cleaned.is_blank] = 0.0
         row, sample = find_negative_peaks(filtered, depth_uv[columns], apart, first, last)
         samples.append(sample - first + piece.start)
         channels.append(row + columns.start)
         # Channels are counted only in the piece that a pulse starts in; the duration is seen in any of them.
-        saturation[:, 0] += cleaned.saturated * piece.owned
+        saturation[:, 0] += cleaned.saturated * is_owned
         saturation[:, 1] = np.maximum(saturation[:, 1], cleaned.longest_ms)
-    return _Found(np.concatenate(samples), np.concatenate(channels), piece.first_stimulus, saturation, piece.lost)
+    return _Found(np.concatenate(samples), np.concatenate(channels), piece.first_stimulus, saturation, lost)
 
 
-def _filtered(
-    rows: Float32[np.ndarray, "channels samples"], settings: Detection, rate_hz: float
-) -> Float32[np.ndarray, "channels samples"]:
-    if settings.band_hz is None:
-        return np.asarray(rows - np.median(rows, axis=1, keepdims=True), dtype=np.float32)
-    return band_pass(rows, settings.band_hz, rate_hz)
+def median_noise_uv(voltage_uv: Traces, is_blank: Flags | None = None) -> Levels:
+    """Standard deviation of each channel's noise, in filtered traces: median(|v - median(v)|) / 0.6745.
+
+    NaN for a channel of which nearly everything is blanked.
+    """
+    if is_blank is not None and is_blank.any():
+        # A sample counts if no channel is blanked, if there are enough of these.
+        kept, samples = ~is_blank.any(axis=0), voltage_uv.shape[1]
+        if np.count_nonzero(kept) < 0.5 * samples:
+            rows = [row[~blank] for row, blank in zip(voltage_uv, is_blank, strict=True)]
+            least = LEAST_SHARE * samples
+            each = [median_noise_uv(row[None])[0] if len(row) >= least else np.nan for row in rows]
+            return np.array(each, dtype=np.float32)
+        voltage_uv = voltage_uv[:, kept]
+    # Neighbouring samples of a filtered trace are correlated: a subset of them is as informative.
+    voltage_uv = voltage_uv[:, :: max(voltage_uv.shape[1] // NOISE_SAMPLES, 1)]
+    return np.asarray(_median(np.abs(voltage_uv - _median(voltage_uv)[:, None])) / NORMAL, dtype=np.float32)
 
 
-def _lost(lost: Int64[np.ndarray, " channels"], samples: int) -> Iterator[Finding]:
+def _median(values: Float32[np.ndarray, "rows values"]) -> Float32[np.ndarray, " rows"]:
+    """The (upper) median of each row by one partition; numpy's does three and takes several times as long."""
+    middle = values.shape[1] // 2
+    return np.asarray(np.partition(values, middle, axis=1)[:, middle], dtype=np.float32)
+
+
+def find_negative_peaks(
+    voltage_uv: Traces, depth_uv: Levels, apart: int, first: int, last: int
+) -> tuple[Int64[np.ndarray, " peaks"], Int64[np.ndarray, " peaks"]]:
+    """Rows and samples of the negative peaks from sample `first` on until `last`.
+
+    A sample t is a peak if v(t) < -depth and v(t) <= v(s) for all s within `apart` samples, at least 1; of equal ones,
+    the first. A channel of infinite depth has none.
+    """
+    inner = voltage_uv[:, first:last]
+    # The neighbourhood is checked for these few samples only.
+    row, column = np.nonzero(inner < -depth_uv[:, None])
+    column = column + first
+    before, after = np.maximum(column - 1, 0), np.minimum(column + 1, voltage_uv.shape[1] - 1)
+    peak_uv = voltage_uv[row, column]
+    low = (peak_uv <= voltage_uv[row, before]) & (peak_uv <= voltage_uv[row, after])
+    row, column, peak_uv = row[low], column[low], peak_uv[low]
+    padded = np.pad(voltage_uv, ((0, 0), (apart, apart)), constant_values=np.inf)
+    around = padded[row[:, None], column[:, None] + np.arange(2 * apart + 1)[None, :]]
+    is_least = np.all(peak_uv[:, None] < around[:, :apart], axis=1)
+    is_least &= np.all(peak_uv[:, None] <= around[:, apart + 1 :], axis=1)
+    return row[is_least], column[is_least]
+
+
+def band_pass(voltage_uv: Traces, band_hz: tuple[float, float] | None, rate_hz: float) -> Traces:
+    """Filter each row, zero-phase, by Fourier transform; `MARGIN_S` at both ends is not usable.
+
+    The gain at frequency f is |H(f)|^2, H being a Butterworth band-pass of order 3 whose |H|^2 is a half at the ends of
+    the band: the result of filtering forwards and backwards, without the two passes. Without a band, for traces that
+    are filtered already, only the median is subtracted.
+    """
+    if band_hz is None:
+        return np.asarray(voltage_uv - np.median(voltage_uv, axis=1, keepdims=True), dtype=np.float32)
+    samples = voltage_uv.shape[1]
+    length = fft.next_fast_len(samples, real=True)
+    spectrum = fft.rfft(voltage_uv, length, axis=1)
+    spectrum *= _gain(length, band_hz, rate_hz)
+    return np.asarray(fft.irfft(spectrum, length, axis=1)[:, :samples], dtype=np.float32)
+
+
+@lru_cache(maxsize=8)
+def _gain(length: int, band_hz: tuple[float, float], rate_hz: float) -> Float32[np.ndarray, " frequencies"]:
+    sections = signal.butter(ORDER, band_hz, "bandpass", fs=rate_hz, output="sos")
+    _, gain = signal.sosfreqz(sections, worN=fft.rfftfreq(length, 1 / rate_hz), fs=rate_hz)
+    return np.asarray(np.abs(gain) ** 2, dtype=np.float32)
+
+
+def _lost(lost: Counts, samples: int) -> Iterator[Finding]:
     if n := int(lost.sum()):
         n_channels = np.count_nonzero(lost)
         share = n / (samples * n_channels)
@@ -202,9 +267,7 @@ def _lost(lost: Int64[np.ndarray, " channels"], samples: int) -> Iterator[Findin
         yield Finding("samples-lost", "note" if share < MUCH_LOST else "warning", message, float(n))
 
 
-def _findings(
-    noise_uv: Float32[np.ndarray, " channels"], n_stimuli: int, saturation: np.ndarray, settings: Detection
-) -> Iterator[Finding]:
+def _findings(noise_uv: Levels, n_stimuli: int, saturation: np.ndarray, settings: Detection) -> Iterator[Finding]:
     n, middle = len(noise_uv), float(np.median(noise_uv)) if len(noise_uv) else 0.0
     yield Finding("noise", "note", f"noise: {middle:.2f} uV on the median of {n:,} channels; spikes are negative "
                   f"peaks of {settings.threshold:g} times their channel's noise and more", middle)  # fmt: skip

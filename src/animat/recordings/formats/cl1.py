@@ -94,12 +94,11 @@ def _stimuli(file: Hdf5File) -> tuple[Column, dict[str, Any]]:
     """First frame of each stimulus, and its electrodes."""
     if not file.has("stims"):
         return np.empty(0, np.int64), {}
-    frame, channel = (column.astype(np.int64) for column in file.columns("stims", "timestamp", "channel"))
-    frames, which = np.unique(frame, return_inverse=True)
-    electrodes: list[set[int]] = [set() for _ in frames]
-    for stimulus, electrode in zip(which.tolist(), channel.tolist(), strict=True):
-        electrodes[stimulus].add(electrode)
-    return frames, {"stimulus_electrodes": padded([sorted(pulsed) for pulsed in electrodes])}
+    columns = [column.astype(np.int64) for column in file.columns("stims", "timestamp", "channel")]
+    frame, channel = np.unique(np.stack(columns), axis=1)
+    frames, first = np.unique(frame, return_index=True)
+    electrodes = np.split(channel, first[1:])[: len(frames)]
+    return frames, {"stimulus_electrodes": padded([pulsed.tolist() for pulsed in electrodes])}
 
 
 def _parameters(file: Hdf5File, stimulus: Column, findings: list[Finding]) -> dict[str, Any]:

@@ -12,14 +12,7 @@ import numpy as np
 from animat.errors import InvalidFile, did_you_mean, in_file, some_of
 from animat.recordings.columns import REQUIRED, Column, PlainColumns
 from animat.recordings.findings import Finding
-from animat.recordings.formats.text_table import (
-    TextTable,
-    as_numbers,
-    folded,
-    is_number,
-    read_text_table,
-    whole_numbers,
-)
+from animat.recordings.formats.text_table import TextTable, as_numbers, folded, is_number, read_table, whole_numbers
 from animat.recordings.recording import Recording
 from animat.tables import padded
 
@@ -62,7 +55,7 @@ def read_csv(table: TextTable, stimuli_path: str | os.PathLike[str] | None = Non
         )
         findings = [*findings, Finding("no-stimuli", "refuse", message)]
     else:
-        stimulus_table = read_text_table(stimuli, "stimulus_time_s")
+        stimulus_table = read_table(stimuli, "stimulus_time_s")
         columns |= _columns(stimulus_table, STIMULUS_COLUMNS)
         findings = [*findings, *stimulus_table.findings]
         provenance["stimuli"] = stimuli.name
@@ -71,7 +64,7 @@ def read_csv(table: TextTable, stimuli_path: str | os.PathLike[str] | None = Non
 
 def read_stimuli_csv(path: Path) -> dict[str, Any]:
     """The stimulus columns of `PlainColumns` in a stimulus file; unknown columns are left out."""
-    return _columns(read_text_table(path, "stimulus_time_s"), STIMULUS_COLUMNS)
+    return _columns(read_table(path, "stimulus_time_s"), STIMULUS_COLUMNS)
 
 
 def stimuli_beside(path: Path) -> Path | None:

@@ -11,7 +11,7 @@ from animat.errors import InvalidFile, some_of
 from animat.recordings.columns import Column, PlainColumns, count_out_of_order, duration_between, unsorted_finding
 from animat.recordings.findings import Finding
 from animat.recordings.formats.hdf5 import Hdf5File
-from animat.recordings.formats.nwb_layout import ELECTRODES_TABLE, SUBJECT, UNITS_TABLE
+from animat.recordings.formats.nwb_layout import ELECTRODES, SUBJECT, UNITS
 from animat.recordings.formats.nwb_stimuli import read_stimuli
 from animat.recordings.recording import Recording
 from animat.tables import UNKNOWN
@@ -29,11 +29,11 @@ def read_foreign_nwb(file: Hdf5File, stimuli: str | None, *, spikes: bool = True
     """
     findings: list[Finding] = []
     if spikes:
-        if not file.has(f"{UNITS_TABLE}/spike_times"):
+        if not file.has(f"{UNITS}/spike_times"):
             found = "none and no traces either"
             if raw := [name for name in file.names("acquisition") if file.has(f"acquisition/{name}/data")]:
                 found = f"none: it holds traces ({some_of(raw, 4)}); find spikes in them with animat convert --raw"
-            raise InvalidFile(f"{file.path}: expected spikes in /{UNITS_TABLE}, found {found}")
+            raise InvalidFile(f"{file.path}: expected spikes in /{UNITS}, found {found}")
         columns = _units(file, findings)
     else:
         channels = _electrodes(file) or {"channel_label": np.empty(0, np.str_)}
@@ -43,7 +43,7 @@ def read_foreign_nwb(file: Hdf5File, stimuli: str | None, *, spikes: bool = True
     provenance = {"source": file.path.name, "format": "NWB of another program", **_origin(file)}
     if spikes:
         provenance["channels"] = "units"
-    resolution = file.attribute(f"{UNITS_TABLE}/spike_times", "resolution")
+    resolution = file.attribute(f"{UNITS}/spike_times", "resolution")
     if isinstance(resolution, float) and 1e-9 < resolution < 1:
         columns["sampling_rate_hz"] = 1 / resolution
     return PlainColumns(**columns).to_recording(provenance, tuple(findings))
@@ -51,10 +51,10 @@ def read_foreign_nwb(file: Hdf5File, stimuli: str | None, *, spikes: bool = True
 
 def _units(file: Hdf5File, findings: list[Finding]) -> dict[str, Any]:
     """The spikes, and the units as channel columns."""
-    time_s = file.read(f"{UNITS_TABLE}/spike_times").reshape(-1)
-    counts = _row_lengths(file, f"{UNITS_TABLE}/spike_times", len(time_s))
+    time_s = file.read(f"{UNITS}/spike_times").reshape(-1)
+    counts = _row_lengths(file, f"{UNITS}/spike_times", len(time_s))
     n = len(counts)
-    labels = _labels(file, UNITS_TABLE, UNIT_LABELS, n)
+    labels = _labels(file, UNITS, UNIT_LABELS, n)
     # Units follow each other; spikes count as out of order only within a unit.
     if early := sum(map(count_out_of_order, np.split(time_s, np.cumsum(counts)[:-1]))):
         findings.append(unsorted_finding("spikes", early, len(time_s)))
@@ -79,7 +79,7 @@ def _units(file: Hdf5File, findings: list[Finding]) -> dict[str, Any]:
 
 def _observed(file: Hdf5File, spike_s: Column, stimulus_s: Column) -> dict[str, float]:
     """When the recording starts and how long it is, if intervals in which units were observed cover all spikes."""
-    at = f"{UNITS_TABLE}/obs_intervals"
+    at = f"{UNITS}/obs_intervals"
     edge_s = file.read(at).astype(np.float64) if file.has(at) else np.empty(0)
     edge_s = edge_s[np.isfinite(edge_s)]
     if not len(edge_s) or not len(spike_s) or np.any(spike_s.clip(edge_s.min(), edge_s.max()) != spike_s):
@@ -91,7 +91,7 @@ def _observed(file: Hdf5File, spike_s: Column, stimulus_s: Column) -> dict[str, 
 
 def _electrode_of_unit(file: Hdf5File, n: int) -> Column | None:
     """The first row of the electrodes table that each unit refers to, -1 for none; None without such a column."""
-    at = f"{UNITS_TABLE}/electrodes"
+    at = f"{UNITS}/electrodes"
     if not file.has(at):
         return None
     rows = file.read(at).astype(np.int64).reshape(-1)
@@ -106,7 +106,7 @@ def _electrode_of_unit(file: Hdf5File, n: int) -> Column | None:
 
 def _electrodes(file: Hdf5File) -> dict[str, Any]:
     """The electrodes table as channel columns; empty if there is none."""
-    at = ELECTRODES_TABLE
+    at = ELECTRODES
     if not file.has(f"{at}/id"):
         return {}
     number = file.read(f"{at}/id").astype(np.int64).reshape(-1)

@@ -160,14 +160,12 @@ class Hdf5File:
         value = value.item() if isinstance(value, np.generic) else value
         return value.decode("utf-8", "replace") if isinstance(value, bytes) else value
 
-    def row_lengths(self, where: str, n_values: int) -> np.ndarray[Any, np.dtype[np.int64]]:
+    def row_lengths(self, where: str, n: int) -> np.ndarray[Any, np.dtype[np.int64]]:
         """How many values each row of a ragged column of NWB has; refuses an index that does not divide them."""
         ends = self.read(f"{where}_index").astype(np.int64).reshape(-1)
         lengths = np.diff(ends, prepend=0)
-        if np.any(lengths < 0) or lengths.sum() != n_values:
-            raise InvalidFile(
-                f"{self.path}: /{where}_index does not divide the {n_values:,} values of /{where}: damaged"
-            )
+        if np.any(lengths < 0) or lengths.sum() != n:
+            raise InvalidFile(f"{self.path}: /{where}_index does not divide the {n:,} values of /{where}: damaged")
         return lengths
 
 
@@ -193,8 +191,6 @@ def hdf5_file(path: Path) -> Iterator[Hdf5File]:
             yield Hdf5File(path, file)
     except (InvalidFile, InvalidArgument):
         raise
-    except FileNotFoundError as error:
-        raise InvalidFile(f"{path}: no such file") from error
     except UnusableData as error:
         # The file is not damaged; its contents are invalid.
         raise InvalidFile(f"{path}: {error}") from error
@@ -218,27 +214,22 @@ def _as_text(values: Column) -> Column:
     return np.array(flat, dtype=np.str_).reshape(values.shape)
 
 
-INSPECT_OR_CONVERT = "animat inspect or animat convert; other commands need the file converted first"
-
-
 def choose(
     what: str,
     option: str,
     names: Iterable[str],
     asked: str | None,
     describe: Callable[[str], str] = lambda name: name,
-    commands: str = INSPECT_OR_CONVERT,
+    commands: str = "animat inspect or animat convert; other commands need the file converted first",
 ) -> str:
     """The name that was asked for, or the only one; other cases are refused, with a list of the names.
 
     `what` is chosen and where (`rig.h5: part`), by an `option` (`--part`) of some `commands`.
     """
-    candidates = list(names)
-    if asked in candidates or (asked is None and len(candidates) == 1):
-        return asked or candidates[0]
-    listed = some_of([describe(name)[:80] for name in candidates])
+    found = list(names)
+    if asked in found or (asked is None and len(found) == 1):
+        return asked or found[0]
+    listed = some_of([describe(name)[:80] for name in found])
     if asked is not None:
         raise InvalidFile(f"{what}: expected one of {listed}; got {asked}")
-    raise InvalidFile(
-        f"{what}: expected one, found {len(candidates)}: {listed}; choose with {option} NAME in {commands}"
-    )
+    raise InvalidFile(f"{what}: expected one, found {len(found)}: {listed}; choose with {option} NAME in {commands}")

@@ -10,7 +10,7 @@ import numpy as np
 
 from animat.errors import InvalidFile
 from animat.recordings.columns import Column, PlainColumns, recorded_span
-from animat.recordings.findings import Finding, Severity
+from animat.recordings.findings import Finding
 from animat.recordings.formats.hdf5 import Hdf5File, choose, is_positive, unavailable_filters
 from animat.recordings.formats.stimulus_text import stimulus_columns
 from animat.recordings.recording import Recording
@@ -86,8 +86,8 @@ def read_maxwell(
     routed = np.isin(spike_channel, columns["channel_label"])
     if lost := int(np.count_nonzero(~routed)):
         message = f"{lost:,} of {len(routed):,} spikes are on channels without a routed electrode and are left out"
-        severity: Severity = "note" if lost < 0.01 * len(routed) else "warning"
-        findings.append(Finding("spikes-not-routed", severity, message, float(lost)))
+        is_few = lost < 0.01 * len(routed)
+        findings.append(Finding("spikes-not-routed", "note" if is_few else "warning", message, float(lost)))
     spike_time_s = (spike_frame[routed].astype(np.int64) - first_frame) / rate_hz
     stimulus_time_s = (stimulus_frame.astype(np.int64) - first_frame) / rate_hz
     if layout.frames is not None:
@@ -154,8 +154,8 @@ def _count_frames(layout: _Layout, ends: list[tuple[int, int, int]]) -> None:
     lost = max(last - first + 1 - n for first, last, n in ends)
     if lost > 0:
         message = f"{lost:,} frames ({lost / layout.rate_hz:.3g} s) are missing from the recording"
-        severity: Severity = "warning" if lost > 0.001 * max(n for _, _, n in ends) else "note"
-        layout.findings.append(Finding("frames-lost", severity, message, float(lost)))
+        is_few = lost <= 0.001 * max(n for _, _, n in ends)
+        layout.findings.append(Finding("frames-lost", "note" if is_few else "warning", message, float(lost)))
 
 
 def _bits(file: Hdf5File, layout: _Layout) -> tuple[Column, dict[str, Any]]:
@@ -176,9 +176,7 @@ def _events(file: Hdf5File, layout: _Layout, stimuli: str | None) -> tuple[Colum
     if "eventtype" in names and len(frame):
         types = file.read(at, "eventtype")
         counts = {str(t): int(np.count_nonzero(types == t)) for t in np.unique(types)}
-        which = choose(
-            f"{file.path}: stimuli", "--stimuli", counts, stimuli, lambda name: f"{name} ({counts[name]:,} events)"
-        )
+        which = choose(f"{file.path}: stimuli", "--stimuli", counts, stimuli, lambda t: f"{t} ({counts[t]:,} events)")
         is_stimulus = types.astype(np.str_) == which
         if left := int(np.count_nonzero(~is_stimulus)):
             message = f"{left:,} events of other types than {which} are left out"

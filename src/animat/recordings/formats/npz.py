@@ -79,8 +79,6 @@ def load_columns(path: Path, known: tuple[str, ...]) -> tuple[dict[str, Any], li
                     columns[name] = _single(f"{path}: {key}", name, array) if name in SINGLE else array
                 else:
                     left_out.append(key)
-    except FileNotFoundError as error:
-        raise InvalidFile(f"{path}: no such file") from error
     except ValueError as error:
         # Any other ValueError of numpy is about a damaged header.
         pickled = "Object arrays" in str(error)

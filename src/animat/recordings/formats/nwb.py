@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import io
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from functools import lru_cache
-from typing import Any, TypeVar
+from typing import Any
 
 import h5py
 import numpy as np
@@ -17,14 +17,7 @@ from animat.compilation import pynwb_importable
 from animat.errors import InvalidArgument, InvalidFile, UnusableData, in_file
 from animat.recordings.formats.foreign_nwb import read_foreign_nwb
 from animat.recordings.formats.hdf5 import Hdf5File
-from animat.recordings.formats.nwb_layout import (
-    ELECTRODES_TABLE,
-    FORMAT_VERSION,
-    PROVENANCE_TABLE,
-    RECORDING_TABLE,
-    STIMULI_TABLE,
-    UNITS_TABLE,
-)
+from animat.recordings.formats.nwb_layout import ELECTRODES, FORMAT_VERSION, PROVENANCE, RECORDING, STIMULI, UNITS
 from animat.recordings.formats.nwb_spikes import SpikeBlock, SpikeCounts, write_spikes
 from animat.recordings.metadata import from_metadata
 from animat.recordings.recording import Channels, Recording
@@ -35,8 +28,6 @@ from animat.writing import atomic_write
 
 LARGEST_VALUES = 10_000_000
 """Rows times columns of the electrodes table."""
-
-T = TypeVar("T", int, float, str)
 
 
 @checked_arguments
@@ -84,7 +75,7 @@ def write_nwb(
             with h5py.File(disk, "w") as file, NWBHDF5IO(file=file, mode="w", manager=BuildManager(_types())) as nwb_io:
                 nwb_io.write(tree)
                 if len(recording.channels):
-                    write_spikes(file[f"{UNITS_TABLE}/spike_times"], spikes, of_channels)
+                    write_spikes(file[f"{UNITS}/spike_times"], spikes, of_channels)
         except Exception as error:
             # A full disk is the cause; HDF5's own error only follows from it.
             raise disk.error or error from None
@@ -127,51 +118,45 @@ class _Disk(io.FileIO):
             return size or 0
 
 
-def is_nwb(file: Hdf5File) -> bool:
-    """Whether a file declares itself as NWB."""
-    return "nwb_version" in file.file.attrs
-
-
 def read_nwb(file: Hdf5File, stimuli: str | None = None) -> Recording:
     """Read an open file of `write_nwb`, which equals the original recording, or of another program."""
     path = file.path
-    if not file.has(RECORDING_TABLE):
+    if not file.has(RECORDING):
         return read_foreign_nwb(file, stimuli)
     if stimuli is not None:
         raise InvalidFile(f"{path}: expected no choice of stimuli for animat's own file, got {stimuli!r}")
-    version = _cell(file, "format_version", int)
+    version = int(_cell(file, "format_version"))
     if version > FORMAT_VERSION:
         raise InvalidFile(f"{path}: expected format version {FORMAT_VERSION} or older, got {version}: update animat")
     texts = dict[str, str]()
-    if file.has(PROVENANCE_TABLE):
-        keys, values = (file.read(f"{PROVENANCE_TABLE}/{name}").tolist() for name in ("key", "words"))
+    if file.has(PROVENANCE):
+        keys, values = (file.read(f"{PROVENANCE}/{name}").tolist() for name in ("key", "words"))
         texts = dict(zip(keys, values, strict=True))
-    order, pulses = _cell(file, "presentation_order", str), _cell(file, "presentation_pulses", int)
+    order, pulses = str(_cell(file, "presentation_order")), int(_cell(file, "presentation_pulses"))
+    names = ("sampling_rate_hz", "start_s", "duration_s", "start_min")
+    scalars: dict[str, Any] = {name: float(_cell(file, name)) for name in names}
     times, channels = _spikes(file)
     with in_file(path):
         return Recording(
             spike_times_s=times,
             spike_channels=channels,
             channels=_channels(file),
-            stimuli=_stimuli(file, _cell(file, "stimulus_electrode_columns", int)),
-            sampling_rate_hz=_cell(file, "sampling_rate_hz", float),
-            start_s=_cell(file, "start_s", float),
-            duration_s=_cell(file, "duration_s", float),
-            start_min=_cell(file, "start_min", float),
+            stimuli=_stimuli(file, int(_cell(file, "stimulus_electrode_columns"))),
             presentation=Presentation(order, pulses) if order else None,  # type: ignore[arg-type]
+            **scalars,
             **from_metadata(texts),
         )
 
 
-def _cell(file: Hdf5File, name: str, kind: Callable[[Any], T]) -> T:
-    return kind(file.read(f"{RECORDING_TABLE}/{name}")[0].item())
+def _cell(file: Hdf5File, name: str) -> Any:
+    return file.read(f"{RECORDING}/{name}")[0].item()
 
 
 def _spikes(file: Hdf5File) -> tuple[Float64[np.ndarray, " spikes"], Int64[np.ndarray, " spikes"]]:
-    if not file.has(UNITS_TABLE):
+    if not file.has(UNITS):
         return np.empty(0), np.empty(0, dtype=np.int64)
-    times = file.read(f"{UNITS_TABLE}/spike_times")
-    counts = file.row_lengths(f"{UNITS_TABLE}/spike_times", len(times))
+    times = file.read(f"{UNITS}/spike_times")
+    counts = file.row_lengths(f"{UNITS}/spike_times", len(times))
     channels = np.repeat(np.arange(len(counts)), counts)
     # By channel: a stable sort leaves simultaneous spikes in the order of their channels, as Recording requires.
     order = np.argsort(times, kind="stable")
@@ -179,21 +164,21 @@ def _spikes(file: Hdf5File) -> tuple[Float64[np.ndarray, " spikes"], Int64[np.nd
 
 
 def _channels(file: Hdf5File) -> Channels:
-    if not file.has(ELECTRODES_TABLE):
+    if not file.has(ELECTRODES):
         return Channels(label=np.empty(0, np.str_), electrode=np.empty(0, np.int64), x_um=np.empty(0), y_um=np.empty(0))
-    return Channels(*(file.read(f"{ELECTRODES_TABLE}/{name}") for name in ("label", "electrode_id", "rel_x", "rel_y")))
+    return Channels(*(file.read(f"{ELECTRODES}/{name}") for name in ("label", "electrode_id", "rel_x", "rel_y")))
 
 
 def _stimuli(file: Hdf5File, columns: int) -> Stimuli:
-    time_s = file.read(f"{STIMULI_TABLE}/start_time")
-    if file.has(f"{STIMULI_TABLE}/electrode_ids"):
-        flat = file.read(f"{STIMULI_TABLE}/electrode_ids")
-        lengths = file.row_lengths(f"{STIMULI_TABLE}/electrode_ids", len(flat))
+    time_s = file.read(f"{STIMULI}/start_time")
+    if file.has(f"{STIMULI}/electrode_ids"):
+        flat = file.read(f"{STIMULI}/electrode_ids")
+        lengths = file.row_lengths(f"{STIMULI}/electrode_ids", len(flat))
     else:
         flat, lengths = np.empty(0, np.int64), np.zeros(len(time_s), np.int64)
     if not 0 <= columns <= LARGEST_VALUES // max(len(lengths), 1):
         raise UnusableData(f"stimulus_electrode_columns: expected the width of a table, got {columns}")
     electrodes = np.full((len(lengths), columns), UNKNOWN, dtype=np.int64)
     electrodes[np.arange(columns)[None, :] < lengths[:, None]] = flat
-    others = {name: file.read(f"{STIMULI_TABLE}/{name}") for name in ("frequency_hz", "pattern", "presentation")}
+    others = {name: file.read(f"{STIMULI}/{name}") for name in ("frequency_hz", "pattern", "presentation")}
     return Stimuli(time_s=time_s, electrodes=electrodes, **others)

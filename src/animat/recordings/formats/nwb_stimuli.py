@@ -13,7 +13,7 @@ from animat.errors import InvalidFile, some_of
 from animat.recordings.columns import Column
 from animat.recordings.findings import Finding, left_out_findings
 from animat.recordings.formats.hdf5 import Hdf5File, choose, is_positive
-from animat.recordings.formats.nwb_layout import ELECTRODES_TABLE
+from animat.recordings.formats.nwb_layout import ELECTRODES
 from animat.recordings.formats.text_table import whole_numbers
 from animat.tables import UNKNOWN, padded
 
@@ -24,8 +24,8 @@ COLUMNS = {
     "stimulus_frequency_hz": ("frequency_hz", "frequency", "stimulus_frequency", "stim_frequency"),
     "stimulus_pattern": ("pattern", "stimulus_pattern", "stimulus_type", "stimulus_name", "condition", "label"),
     "stimulus_presentation": ("presentation",),
+    "stimulus_electrodes": ("electrode_ids", "electrode_id", "electrodes", "electrode"),
 }
-ELECTRODES = ("electrode_ids", "electrode_id", "electrodes", "electrode")
 NO_STIMULUS_COLUMNS = ("id", "start_time", "stop_time", "tags", "timeseries")
 """Columns that any table of intervals may have."""
 APART_S = 0.001
@@ -83,20 +83,11 @@ def _of_intervals(file: Hdf5File, at: str, findings: list[Finding]) -> dict[str,
     used = set(NO_STIMULUS_COLUMNS)
     for column, names in COLUMNS.items():
         for name in names:
-            node = file.node(f"{at}/{name}")
-            if not isinstance(node, h5py.Dataset) or node.shape != time_s.shape or node.dtype.kind not in "iufbSO":
-                continue
-            if (values := _values(column, file.read(f"{at}/{name}"), time_s)) is not None:
+            if (values := _values(file, f"{at}/{name}", column, time_s)) is not None:
                 columns[column] = values
                 used.add(name)
                 break
-    for name in ELECTRODES:
-        if (electrodes := _electrodes(file, f"{at}/{name}", len(time_s))) is not None:
-            columns["stimulus_electrodes"] = np.maximum(electrodes, UNKNOWN)
-            used.add(name)
-            break
-    known = COLUMNS | {"stimulus_electrodes": ELECTRODES}
-    missing = [name for column, names in known.items() if column not in columns for name in names]
+    missing = [name for column, names in COLUMNS.items() if column not in columns for name in names]
     present = file.names(at)
     # The index of a ragged column is part of it.
     used |= {f"{name}_index" for name in present}
@@ -104,8 +95,15 @@ def _of_intervals(file: Hdf5File, at: str, findings: list[Finding]) -> dict[str,
     return columns
 
 
-def _values(column: str, values: Column, time_s: Column) -> Column | None:
+def _values(file: Hdf5File, at: str, column: str, time_s: Column) -> Column | None:
     """The values of a column with a known name, as another program means them; None if they cannot be what it says."""
+    if column == "stimulus_electrodes":
+        electrodes = _electrodes(file, at, len(time_s))
+        return None if electrodes is None else np.maximum(electrodes, UNKNOWN)
+    node = file.node(at)
+    if not isinstance(node, h5py.Dataset) or node.shape != time_s.shape or node.dtype.kind not in "iufbSO":
+        return None
+    values = file.read(at)
     if column == "stimulus_frequency_hz":
         return np.where(values > 0, values, np.nan) if values.dtype.kind in "iuf" else None
     is_whole = _are_whole(values)
@@ -157,11 +155,11 @@ def _electrodes(file: Hdf5File, at: str, n: int) -> Column | None:
 
 def _electrodes_in_rows(file: Hdf5File, at: str, rows: Column) -> Column | None:
     """The electrodes in rows of the electrodes table that a column refers to; None for those of another table."""
-    table, column = file.node(ELECTRODES_TABLE), file.dataset(at)
+    table, column = file.node(ELECTRODES), file.dataset(at)
     to = column.attrs.get("table")
     if not isinstance(to, h5py.Reference) or not to or table is None or file.file[to] != table:
         return None
-    numbers = file.read(f"{ELECTRODES_TABLE}/id").astype(np.int64).reshape(-1)
+    numbers = file.read(f"{ELECTRODES}/id").astype(np.int64).reshape(-1)
     if np.any((rows < 0) | (rows >= len(numbers))):
         return None
     return numbers[rows]

@@ -15,17 +15,17 @@ from animat.recordings.findings import Finding, left_out_findings
 from animat.recordings.formats.csv import SPIKE_COLUMNS, STIMULUS_COLUMNS, nearest, plain_column
 from animat.recordings.formats.npz import KEYS, load_columns
 from animat.recordings.formats.text_table import TextTable, folded
-from animat.recordings.response_table import Kind, ResponseTable
+from animat.recordings.recording import ResponseKind, ResponseTable
 
-KINDS: tuple[Kind, ...] = ("count", "rate_hz")
+KINDS: tuple[ResponseKind, ...] = ("count", "rate_hz")
 TABLE_COLUMNS = STIMULUS_COLUMNS | {"stimulus_pattern": (*STIMULUS_COLUMNS["stimulus_pattern"], "condition")}
 NPZ_KEYS = {f"response_{kind}": kind for kind in KINDS}
-_Read = tuple[Float64[np.ndarray, "stimuli channels"], Kind, Column, Int64[np.ndarray, " lines"]]
+_Read = tuple[Float64[np.ndarray, "stimuli channels"], ResponseKind, Column, Int64[np.ndarray, " lines"]]
 """Values, their kind, the channels, and for each line the first line of its stimulus."""
 TRIAL = "trial"
 
 
-def is_response_table(table: TextTable) -> bool:
+def _is_response_table(table: TextTable) -> bool:
     """Whether text is a response table, by its header and the file's name."""
     names, file_name = {folded(head) for head in table.header}, table.path.name.lower()
     # Spike files may have columns of counts and rates too.
@@ -38,19 +38,16 @@ def is_response_table(table: TextTable) -> bool:
     return is_long or any(name.startswith(f"{kind}_") for name in names for kind in KINDS)
 
 
-def is_response_npz(path: Path) -> bool:
-    """Whether an archive holds a response table."""
+def read_response_npz(path: Path) -> ResponseTable | None:
+    """Read a response table from a numpy archive, None if it holds none; nothing in it is ever unpickled."""
     try:
         with zipfile.ZipFile(path) as archive:
             names = archive.namelist()
     except (OSError, zipfile.BadZipFile, NotImplementedError):
-        return False
+        return None
     # If there are spikes too, they are more informative.
-    return any(f"{key}.npy" in names for key in NPZ_KEYS) and "spike_time_s.npy" not in names
-
-
-def read_response_npz(path: Path) -> ResponseTable:
-    """Read a response table from a numpy archive; nothing in it is ever unpickled."""
+    if not any(f"{key}.npy" in names for key in NPZ_KEYS) or "spike_time_s.npy" in names:
+        return None
     of_stimuli = (key for key in KEYS if not key.startswith("spike_"))
     arrays, _, left_out = load_columns(path, (*NPZ_KEYS, "response_window_ms", *of_stimuli))
     keys = [key for key in NPZ_KEYS if key in arrays]
@@ -73,8 +70,10 @@ def read_response_npz(path: Path) -> ResponseTable:
     return _table(values, NPZ_KEYS[key], labels, arrays, window_ms, provenance, findings)
 
 
-def read_response_table(table: TextTable) -> ResponseTable:
-    """Make a response table from text, wide or long."""
+def read_response_table(table: TextTable) -> ResponseTable | None:
+    """Make a response table from text, wide or long; None if it is something else."""
+    if not _is_response_table(table):
+        return None
     is_long = table.place(("channel",)) is not None
     values, kind, labels, first_of = _long(table) if is_long else _wide(table)
     columns: dict[str, Any] = {}
@@ -110,7 +109,7 @@ def _wide(table: TextTable) -> _Read:
     return values, kind, labels, np.arange(len(table.rows))
 
 
-def _label(head: str, kind: Kind) -> str:
+def _label(head: str, kind: ResponseKind) -> str:
     """The part of a header after the kind, such as 12 in `Rate (Hz) 12`."""
     return next(head[i:].strip() for i in range(len(head) + 1) if folded(f"{head[:i]}x") == f"{kind}_x")
 
@@ -174,7 +173,7 @@ def _constant(table: TextTable, name: str) -> float | None:
 
 def _table(
     values: Column,
-    kind: Kind,
+    kind: ResponseKind,
     labels: Column,
     columns: dict[str, Any],
     window_ms: tuple[float, float] | None,
@@ -195,12 +194,8 @@ def _table(
     return ResponseTable(
         values=np.asarray(values, dtype=np.float64)[np.argsort(times, kind="stable")],
         kind=kind,
-        channels=recording.channels,
-        stimuli=recording.stimuli,
         has_times=has_times,
         window_ms=window_ms,
-        start_min=recording.start_min,
-        presentation=recording.presentation,
+        **{name: getattr(recording, name) for name in ("channels", "stimuli", "start_min", "presentation", "findings")},
         provenance={**provenance, **recording.provenance},
-        findings=recording.findings,
     )

@@ -28,10 +28,7 @@ _THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2}(,\d{3})+", re.ASCII)
 class TextTable:
     """A table with its header and cells as text, unchanged from the file.
 
-    Attributes:
-        lines: the line of the file on which each row ends, counted from 1.
-        used: the columns that were looked up.
-        findings: methods add to them.
+    `lines` are those of the file on which rows end, counted from 1; `used` are the columns that were looked up.
     """
 
     path: Path
@@ -100,7 +97,7 @@ class TextTable:
             self.findings.append(Finding(name, "note", message))
 
 
-def read_text_table(path: Path, bare: str | None = None) -> TextTable:
+def read_table(path: Path, bare: str | None = None) -> TextTable:
     """Read a text table in UTF-8, gzipped or not, with as many fields in each row as in the header.
 
     A file without a header may be a single column, whose name is `bare`.

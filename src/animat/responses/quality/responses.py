@@ -11,8 +11,7 @@ from jaxtyping import Bool
 
 from animat.errors import counted, some_of
 from animat.recordings.findings import Finding
-from animat.recordings.recording import Recording
-from animat.recordings.response_table import ResponseTable
+from animat.recordings.recording import Recording, ResponseTable
 from animat.responses.bursts import LEAST_RESPONSES, BurstSeparation
 from animat.responses.condition import RESTING
 from animat.responses.conditions import NO_CONDITION, Assignment, conditions_named
