@@ -218,6 +218,7 @@ def test_recordings_on_disk_are_the_neurons(tmp_path) -> None:
         ({"pole_mass": 1.0}, "cartpole: expected parameters among .*, got 'pole_mass'"),
         ({"recordings": "r", "simulator": synthetic_simulator()}, "recordings, simulator: expected one of them"),
         ({"conditions": "frequency:5,80"}, "conditions: expected only with recordings"),
+        ({"at_min": "x", "recordings": "recordings/"}, "at_min: expected a number of minutes, got 'x'"),
         ({"at_min": 140, "simulator": synthetic_simulator()}, "at_min: expected only with recordings"),
         ({"window_ms": (2.0, 8.0)}, "window_ms: expected only with recordings"),
         ({"kind": "empirical"}, "kind: expected only with recordings"),

@@ -164,7 +164,8 @@ def test_stimuli_without_a_condition_are_counted() -> None:
     # What other kinds could be had is not a list of what the recording has.
     for by in (ByElectrode(), ByInterval((7.0,)), Nothing()):
         none = message(source, "no-condition", by=by)
-        assert f"none of 3 stimuli belongs to the conditions {by}: choose others (--conditions" in none
+        others = " or ".join(each for each in ("frequency", "interval", "electrode", "pattern") if each != str(by))
+        assert f"none of 3 stimuli belongs to the conditions {by}: choose others (--conditions {others})" in none
 
 
 def test_empty_and_thin_conditions() -> None:

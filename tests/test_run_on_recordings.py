@@ -139,7 +139,7 @@ def recorded_by(series: Path, folder: Path, *pulses: Pulse | None) -> Path:
 
 
 OTHERS, WEAK = " as in the other recordings", Pulse((Phase(200, amplitude_mv=-100), Phase(200, amplitude_mv=100)))
-USUAL = " the usual one on a virtual"
+USUAL = " the usual one with --culture virtual"
 
 
 @pytest.mark.parametrize(

@@ -72,7 +72,7 @@ class Replay(SimulatorOptions):
             scene = scene_of_policies(policies, timeline, at_min=self.at_min, span_s=self.span_s, seed=self.seed)
         with Bar("drawing") as progress:
             write_film(scene, self.out, progress)
-        print(f"{self.out}: {scene.title}, {scene.start_s:g} to {scene.stop_s:.1f} s")
+        print(f"{self.out}: {scene.title}, {scene.start_s:.1f} to {scene.stop_s:.1f} s")
         if scene.lost_bytes:
             print(lost_message(scene.lost_bytes))
         return {

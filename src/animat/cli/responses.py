@@ -43,7 +43,8 @@ class SimulatorOptions(ResponseOptions):
     histogram: the paper's; empirical: draw any measured value; default in evaluate and replay: as in the policies'
     training"""
     bins: int | None = None
-    """Bins of a histogram; default: 20; in evaluate and replay: as in the policies' training"""
+    """Bins of a histogram, which is then the simulator; default: 20; in evaluate and replay: as in the policies'
+    training"""
     range_hz: float | None = None
     """Equally wide bins from 0 to this rate, in Hz (the paper: 120); default: edges at percentiles of each recording;
     in evaluate and replay: as in the policies' training"""

@@ -209,7 +209,7 @@ class Run(StimulationOptions):
             is_delivered = self.culture != "replay" or protocol.pulse.kind == usual.pulse.kind
             return (protocol if is_delivered else replace(protocol, pulse=usual.pulse)), []
         pulse = next(iter(pulses), usual.pulse)
-        source = "as in the other recordings" if pulses else f"the usual one on a {self.culture}"
+        source = "as in the other recordings" if pulses else f"the usual one with --culture {self.culture}"
         message = (
             f"the recording at {in_min(calibrating.start_min)}, which calibrates the loop, does not state its pulse: "
             f"the loop delivers {pulse}, {source}; to change it, use --protocol"

@@ -6,6 +6,7 @@ import os
 import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -110,6 +111,7 @@ def set_up(
         recordings = expect_several("recordings", recordings, str | os.PathLike, "a path or several")
     if recordings is not None and simulator is not None:
         raise InvalidArgument("recordings, simulator: expected one of them, got both")
+    expect_kind("at_min", at_min, Real | None, "a number of minutes")
     check_window(window_ms)
     window = None if tuple(window_ms) == DEFAULT_WINDOW_MS else window_ms
     reading = {"at_min": at_min, "conditions": conditions, "kind": kind, "readouts": readouts, "window_ms": window}

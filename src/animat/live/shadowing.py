@@ -18,7 +18,7 @@ from animat.cultures.budget import Account, record_within
 from animat.cultures.series import STATE_FILE, order_seed, room_bytes_of
 from animat.cultures.under_way import PartialRecording
 from animat.cultures.virtual import VirtualCulture
-from animat.errors import AnimatError, BudgetSpent, InvalidFile, Mismatch, UnusableData, as_invalid_file
+from animat.errors import AnimatError, BudgetSpent, InvalidFile, Mismatch, UnusableData, as_invalid_file, counted
 from animat.live.plan import (
     EXCHANGE,
     LOG_FILE,
@@ -256,7 +256,7 @@ class _Run:
             self._note(trainers.swaps(_POLL_S))
             passed_min = (time.monotonic() - self._wall_zero_s) * self.timetable.speed / 60
             mean = "" if math.isnan(trainers.mean_return) else f", return {trainers.mean_return:.1f}"
-            note = f"{len(self.files)} recordings, {len(self.swaps)} swaps{mean}"
+            note = f"{counted(len(self.files), 'recording')}, {counted(len(self.swaps), 'swap')}{mean}"
             if time.monotonic() >= due_s:
                 note += "; waiting for all policies to train on the last recording"
             progress.update(min(passed_min, minute), self.timetable.duration_min, note)

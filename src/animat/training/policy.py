@@ -387,7 +387,7 @@ def load_policies(path: str | os.PathLike[str]) -> dict[str, Policy]:
     path = Path(path)
     if not is_folder(path):
         if is_absent(path):
-            raise InvalidFile(f"{path}: expected a policy file or a folder of them, got no such file; train them first")
+            raise InvalidFile(f"{path}: expected a policy or a folder of policies, got no such file; train them first")
         return {path.stem: Policy.load(path)}
     # Hidden files are unfinished: a process was killed while writing them.
     whole = [file for file in path.glob("*.safetensors") if not file.name.startswith(".")]

@@ -79,4 +79,4 @@ def _different(tables: Sequence[Channels]) -> int:
 def _words(value: object) -> str:
     if isinstance(value, tuple) and value and isinstance(value[0], Condition):
         return ", ".join(condition.label for condition in value)
-    return ", ".join(value.names) if isinstance(value, Readouts) else str(value)
+    return ", ".join(value.names) if isinstance(value, Readouts) else "unknown" if value is None else str(value)

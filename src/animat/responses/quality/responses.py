@@ -96,9 +96,9 @@ def _left_out(
         kind = by.partition(":")[0]
         occurring = conditions_named(kind).assign(stimuli).conditions if kind in _NAMED_ALONE else ()
         known = f"; the recording has {some_of([each.label for each in occurring])}" if occurring else ""
+        others = " or ".join(each for each in ("frequency", "interval", "electrode", "pattern") if each != by)
         message = (
-            f"none of {n_read} stimuli belongs to the conditions {by}{known}: choose others (--conditions frequency, "
-            "interval, electrode or pattern)"
+            f"none of {n_read} stimuli belongs to the conditions {by}{known}: choose others (--conditions {others})"
         )
         yield Finding("no-condition", "refuse", message, float(without))
     elif without:
