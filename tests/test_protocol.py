@@ -147,6 +147,7 @@ def test_one_pattern_can_be_repeated() -> None:
         ({"frequencies_hz": ()}, "frequencies_hz: expected at least 1"),
         ({"frequencies_hz": (5, 5)}, "frequencies_hz: expected each once"),
         ({"frequencies_hz": (5, 5.000001)}, "frequencies_hz: expected each once, got 5, 5.000001"),
+        ({"frequencies_hz": (5, 5000)}, "frequencies_hz: expected at most 1111 Hz, as a pulse lasts 900 us, got 5"),
         ({"frequencies_hz": (0,)}, "frequencies_hz: expected more than 0, got 0"),
         ({"order": "shuffled"}, "order: expected 'blocked' or 'mixed'"),
         ({"pulses": 0}, "pulses: expected at least 1"),
@@ -171,7 +172,7 @@ def test_a_protocol_with_more_pulses_than_a_recording_can_have_is_refused() -> N
     with pytest.raises(InvalidArgument, match="pulses: expected at most 10,000,000"):
         Protocol(pulses=10**12)
     # Two frequencies, four places and 125 trials of 10,000 pulses are as many as can be.
-    most: dict[str, Any] = {"frequencies_hz": (10_000, 5000), "places": "corners", "trials": 125}
+    most: dict[str, Any] = {"frequencies_hz": (1000, 500), "places": "corners", "trials": 125}
     assert Protocol(**most, pulses=10_000).n_places == 4
     with pytest.raises(InvalidArgument, match=r"pulses: expected at most 10,000,000 .*, got 10,001,000$"):
         Protocol(**most, pulses=10_001)
