@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from animat.recordings.findings import Finding
 from animat.recordings.quality import recording_findings
@@ -195,6 +197,37 @@ def test_channels_that_fire_as_no_neurons_do() -> None:
     assert "noisy-channels" not in found
 
 
+def test_channels_that_stop() -> None:
+    rng = np.random.default_rng(0)
+    channel, time_s = np.repeat(np.arange(30), 100), rng.uniform(100, 500, 3000)
+
+    def found(is_kept: np.ndarray) -> dict[str, Finding]:
+        rows = np.column_stack([time_s[is_kept] - 100, channel[is_kept]])
+        return {f.name: f for f in recording_findings(recording(rows, [1, 2], 40, 400.0))}
+
+    assert "stopped-channels" not in found(np.ones(3000, np.bool_))
+    one = found((channel != 7) | (time_s < 350))["stopped-channels"]
+    assert (one.severity, one.value) == ("note", 1)
+    assert "but not after 260 s: 1 of 40 (7);" in one.message
+    several = found((channel > 3) | (time_s < 320 + 10 * channel))["stopped-channels"]
+    assert (several.severity, several.value) == ("warning", 4)
+    assert "but not after 220 s to 260 s: 4 of 40 (0, 1, 2, 3);" in several.message
+    # Silent at the beginning, or for less than a quarter of the recording, or most of the time.
+    for is_kept in (time_s > 250, time_s < 419, time_s < 170):
+        assert "stopped-channels" not in found((channel != 7) | is_kept)
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_channels_of_any_rate_hardly_ever_stop_by_chance(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    n_spikes = rng.poisson(10 ** rng.uniform(0, 3, 1000))
+    channel = np.repeat(np.arange(1000), n_spikes)
+    found = recording_findings(
+        recording(np.column_stack([rng.uniform(0, 300, len(channel)), channel]), [1], 1000, 300.0)
+    )
+    assert all(f.severity == "note" and f.value <= 3 for f in found if f.name == "stopped-channels")
+
+
 def test_the_organoid_on_a_maxone_can_be_used_with_care(real_data: Path) -> None:
     inspection = inspect_recording(read_recording(real_data / "organoid_cartpole_maxone.npz"))
     found = {f.name: f for f in inspection.findings}
@@ -210,6 +243,7 @@ def test_brainoware_cannot_be_used_in_the_papers_window(real_data: Path) -> None
     assert inspection.verdict == "not usable"
     assert found["dead-window"].severity == "refuse"
     assert "an artefact counted as spikes" in found["artefact-spikes"].message
+    assert "stopped-channels" not in found
     assert found["artefact-spikes"].severity == "warning"
 
 

@@ -22,6 +22,10 @@ MOSTLY_SILENT = 0.5
 FAST_HZ = 100.0
 """On average over a recording: the few neurons near one electrode cannot fire so fast for minutes."""
 HOLDS_MOST, SEVERAL, NAMED = 1 / 3, 8, 6
+PARTS, STEADY, STOPPED_PARTS, STOPPED_S = 20, 0.9, 5, 60.0
+"""A channel has stopped if it fired in this share of a recording's parts, or more, up to its last spike, and is then
+silent for so many parts and seconds; by chance hardly one of 10,000 does."""
+STOPPED_SHARE = 0.05
 
 
 def recording_findings(recording: Recording | ResponseTable) -> tuple[Finding, ...]:
@@ -118,3 +122,26 @@ def _on_channels(recording: Recording) -> Iterator[Finding]:
             f"with {100 * share:.0f} % of all spikes; raise their threshold or leave them out of the routing"
         )
         yield Finding("noisy-channels", "warning" if share > 0.1 else "note", message, float(len(noisy)))
+    yield from _stopped_channels(recording)
+
+
+def _stopped_channels(recording: Recording) -> Iterator[Finding]:
+    """A finding on channels that fire steadily and from some time on not at all: a lost contact, a dead site."""
+    part_s, n = recording.duration_s / PARTS, len(recording.channels)
+    if part_s * STOPPED_PARTS < STOPPED_S:
+        return
+    part = np.clip((recording.spike_times_s - recording.start_s) // part_s, 0, PARTS - 1).astype(np.int64)
+    fired = np.bincount(recording.spike_channels * PARTS + part, minlength=n * PARTS).reshape(n, PARTS) > 0
+    until = np.where(fired.any(axis=1), PARTS - np.argmax(fired[:, ::-1], axis=1), 0)
+    stopped = (fired.sum(axis=1) >= STEADY * until) & (until >= STOPPED_PARTS) & (until <= PARTS - STOPPED_PARTS)
+    if not (several := int(np.count_nonzero(stopped))):
+        return
+    last_s = recording.start_s + part_s * until[stopped]
+    when = f"{last_s.min():.0f} s" + (f" to {last_s.max():.0f} s" if last_s.max() > last_s.min() else "")
+    message = (
+        f"channels that fire steadily, but not after {when}: {several:,} of {n:,} "
+        f"({some_of(recording.channels.label[stopped].tolist(), NAMED)}); they count in rates per channel: check their "
+        "contact, or leave them out of the routing"
+    )
+    is_many = several > STOPPED_SHARE * np.count_nonzero(until)
+    yield Finding("stopped-channels", "warning" if is_many else "note", message, float(several))
