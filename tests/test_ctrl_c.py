@@ -180,6 +180,9 @@ def test_an_interrupted_session_is_reported_as_not_resumable(tmp_path, monkeypat
     (tmp_path / "session.nwb").touch()
     assert animat(command) == 130
     assert "recover" not in capsys.readouterr().err
+    monkeypatch.setattr("animat.cli.live.Live.run", interrupted)
+    assert animat(["live", "cartpole", "--out", str(tmp_path)]) == 130
+    assert "kept; a live run cannot be resumed: start a new one in another folder\n" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("status", "printed"), [(0, "all\nat exit\n"), (1, "all\nat exit\n"), (130, "all\n")])

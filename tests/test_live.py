@@ -514,6 +514,8 @@ def test_what_cannot_be_is_refused_before_the_first_pulse(tmp_path: Path) -> Non
         (["--policies", "0"], "--policies: expected at least 1, got 0"),
         (["--seed", "-1"], "--seed: expected"),
         (["--culture-seed", "-1"], "--culture-seed: expected 0 or more, got -1"),
+        (["--culture", "maxone", "--culture-seed", "2"], "--culture-seed: expected none for --culture maxone, got 2"),
+        (["--budget-pulses", "0"], "--budget-pulses: expected at least 1, got 0"),
         (["--patience-s", "nan"], "--patience-s: expected"),
         (["--pause-s", "-1"], "--pause-s: expected"),
         (["--budget-pulses", "-1"], "--budget-pulses: expected"),

@@ -158,7 +158,9 @@ def _what_is_left(command: Command) -> str:
         recover = f"; its recording is not written yet: animat recover {shlex.quote(str(command.out))}"
         recover = "" if (command.out / "session.nwb").exists() else recover
         return f"{recover}; finished work is kept; a session cannot be resumed: start a new one in another folder"
-    return f"; finished work is kept{'' if isinstance(command, Run | Live) else '; run it again to resume'}"
+    if isinstance(command, Live):
+        return "; finished work is kept; a live run cannot be resumed: start a new one in another folder"
+    return f"; finished work is kept{'' if isinstance(command, Run) else '; run it again to resume'}"
 
 
 _RENAMED = {

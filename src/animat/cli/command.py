@@ -10,11 +10,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-from animat.errors import InvalidArgument, InvalidFile, LoopEnded
+from animat.errors import InvalidArgument, InvalidFile, LoopEnded, expect_at_least
 from animat.process import own_cores
 
 if TYPE_CHECKING:
     from animat.closed_loop.session import Session
+    from animat.cultures.budget import Account
     from animat.studies.specification import RobotSpec
     from animat.training.settings import SAC
 
@@ -89,7 +90,7 @@ class StimulationOptions(FolderCommand):
     selection: Path | None = None
     """For a MaxOne: the file of its electrodes"""
     culture_seed: int | None = None
-    """Which virtual culture, or which patterns of a CL1; default: in run that of the recordings, else 1"""
+    """Which virtual culture, patterns of a CL1 or draws of a replay; default: in run that of the recordings, else 1"""
     budget_pulses: int | None = None
     """Most pulses in all, in live including those of the recordings; default: no limit but the culture's own"""
     budget_per_electrode: int | None = None
@@ -109,6 +110,19 @@ class StimulationOptions(FolderCommand):
     default: 10 with one pulse and adaptive thresholds, else 0"""
     patience_s: float = 10.0
     """Seconds beyond the expected time that a culture, robot or agent may take before the session ends"""
+
+    def _check_culture_seed(self) -> None:
+        # Later it would be called `seed`, as the policies' is.
+        expect_at_least("--culture-seed", self.culture_seed, 0)
+        if self.culture_seed is not None and self.culture == "maxone":
+            raise InvalidArgument(f"--culture-seed: expected none for --culture maxone, got {self.culture_seed}")
+
+    def _account(self) -> Account:
+        from animat.cultures.budget import Account, Budget
+
+        expect_at_least("--budget-pulses", self.budget_pulses, 1)
+        expect_at_least("--budget-per-electrode", self.budget_per_electrode, 1)
+        return Account(Budget(self.budget_pulses, self.budget_per_electrode))
 
     def _loop_settings(self) -> dict[str, Any]:
         names = ("on_burst", "on_late", "pause_s", "warm_up", "settling", "patience_s")

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from tyro.conf import Positional
 
 from animat.cli.command import StimulationOptions, expect_no_fault, read_sac
-from animat.errors import InvalidArgument, expect_at_least
+from animat.errors import InvalidArgument
 from animat.writing import exclusive_lock
 
 if TYPE_CHECKING:
@@ -66,7 +66,6 @@ class Live(StimulationOptions):
     def run(self) -> dict[str, Any]:
         from animat.coding.mapping import mapping_named
         from animat.compilation import keep_compilations
-        from animat.cultures.budget import Account, Budget
         from animat.cultures.kinds import culture_of, pulse_for
         from animat.goals.robot import with_goal
         from animat.live.plan import Timetable, check_plan
@@ -87,8 +86,7 @@ class Live(StimulationOptions):
                 f"--recordings: expected some for a replay and none for others, got {len(self.recordings)} for "
                 f"{self.culture}: a live run records the culture itself"
             )
-        # Later it would be called `seed`, as the policies' is.
-        expect_at_least("--culture-seed", self.culture_seed, 0)
+        self._check_culture_seed()
         speed = (30.0 if simulated else 1.0) if self.speed is None else self.speed
         timetable = Timetable(self.interval_min, self.duration_min, speed)
         robot = robot_named(self.robot)
@@ -104,7 +102,7 @@ class Live(StimulationOptions):
             percentiles=self.percentiles,
             algorithm=read_sac(self.sac),
         )
-        account = Account(Budget(self.budget_pulses, self.budget_per_electrode))
+        account = self._account()
         protocol = Protocol(order=self.order, pulses=self.pulses, trials=self.trials, pulse=pulse_for(self.culture))
         settings = self._loop_settings()
         check_plan(training, protocol, self.out, timetable, self.episodes, settings, account)

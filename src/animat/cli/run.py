@@ -84,7 +84,6 @@ class Run(StimulationOptions):
         from animat.closed_loop.loop import Loop
         from animat.closed_loop.session import expect_no_session
         from animat.compilation import keep_compilations
-        from animat.cultures.budget import Account, Budget
         from animat.cultures.same_culture import other_channels, other_culture, other_patterns
         from animat.neurons.simulator import check_binning
         from animat.reality_gap import run_policies
@@ -96,7 +95,7 @@ class Run(StimulationOptions):
         if fit["kind"] in ("histogram", None):
             check_binning(fit["bins"], fit["range_hz"])
         settings = {**self._loop_settings(), "pulses": self.pulses, "real_time": self.real_time}
-        account = Account(Budget(self.budget_pulses, self.budget_per_electrode))
+        account = self._account()
         keep_compilations()
         recordings = read_recordings(self.recordings)
         calibration = self._calibration(recordings, first, fit)
@@ -145,8 +144,7 @@ class Run(StimulationOptions):
 
         check_episodes("--episodes", self.episodes)
         expect_at_least("--seed", self.seed, 0)
-        # Later it would be called `seed`, as the policies' is.
-        expect_at_least("--culture-seed", self.culture_seed, 0)
+        self._check_culture_seed()
         policies = policies_for(self.robot, self.mapping, self.policies)
         first = check_policies(policies)
         if not self.recordings:

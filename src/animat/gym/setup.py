@@ -97,6 +97,8 @@ def set_up(
         InvalidFile: for recordings that cannot be read.
         UnusableData: for recordings that no controller can learn from.
     """
+    if robot == "":
+        raise InvalidArgument("robot: expected a name, as in gymnasium.make('Animat/Robot-v0', robot='arm'), got none")
     body = robot_named(robot, **parameters)
     if isinstance(body, HostRobot):
         raise InvalidArgument(
