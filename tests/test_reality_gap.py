@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import signal
 import time
@@ -929,6 +930,22 @@ class TestCommand:
         assert "session.nwb: cannot be written" in printed.err
         assert "animat recover" in printed.err
         assert f"recording: {folder}" not in printed.out
+
+    def test_without_room_for_its_files_no_pulse_is_delivered(
+        self, folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        culture = FakeCulture()
+        monkeypatch.setattr("animat.cultures.kinds.culture_of", lambda *_, **__: culture)
+        usage = shutil.disk_usage(folder)
+        given = [str(folder / "policies"), "--recordings", str(folder / "recordings"), "--out", str(folder / "new")]
+        for free, status in ((1000, 1), (10**9, 0)):
+            monkeypatch.setattr("animat.writing.shutil.disk_usage", lambda _, free=free: usage._replace(free=free))
+            assert main(["run", *given, "--episodes", "1", "--controls", "random"]) == status
+            assert (culture.deliveries == 0) == bool(status)
+            assert (folder / "new").exists() != bool(status)
+            if status:
+                said = capsys.readouterr().err.splitlines()[-1]
+                assert re.search(r"new: expected .* MB free for the output, got 0.00 MB: make room, or choose", said)
 
     def test_a_polite_kill_closes_the_culture(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         def kill(culture: FakeCulture, observed: Observed) -> Observed:

@@ -14,6 +14,9 @@ from animat.reality_gap.calibration import Calibration
 from animat.responses.condition import RESTING
 from animat.responses.quality.drift import LARGE
 
+_BYTES_PER_MIN = 5e6
+"""What the log and the recording of a session of 1,024 channels fill."""
+
 
 @dataclass(frozen=True)
 class Outlook:
@@ -28,6 +31,11 @@ class Outlook:
     planned_min: float
     drifted_min: tuple[float, float] | None
     budget_min: float
+
+    @property
+    def room_bytes(self) -> float:
+        """How much the session's files will fill."""
+        return _BYTES_PER_MIN * min(self.planned_min, self.budget_min)
 
     def __str__(self) -> str:
         text = f"the session is planned for about {self.planned_min:.0f} min of the culture's time; "

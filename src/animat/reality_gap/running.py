@@ -46,6 +46,7 @@ from animat.robots.grid import grid_for, why_no_grid
 from animat.robots.host import HostRobot
 from animat.training.policy import Policy, first_of_alike
 from animat.wrappers import NeuralObservation
+from animat.writing import expect_writable
 
 FEWEST_OF_A_CONTROL = 5
 """Fewest episodes of a control: enough to show (p < 0.01) that policies with ten or more outperform it."""
@@ -178,6 +179,7 @@ def run_policies(
         report(f"each pulse: {loop.pulse}")
         report(str(expected))
     try:
+        expect_writable(folder, room_bytes=expected.room_bytes)
         session = run_session(
             culture,
             loop,
