@@ -26,9 +26,9 @@ html_title = f"animat {release}"
 html_show_sourcelink = False
 
 _GUIDE = (
-    *("recordings", "cultures", "virtual-culture", "hardware", "recording-a-culture", "responses", "robots", "goals"),
-    *("training", "lessons", "evaluation", "closed-loop", "reality-gap", "live", "agents", "studies", "tuning", "watch"),
-    *("cluster", "gymnasium", "api", "architecture", "dependencies"),
+    *("recordings", "cultures", "virtual-culture", "hardware", "recording-a-culture", "responses"),
+    *("robots", "own-robots", "goals", "training", "lessons", "evaluation", "closed-loop", "reality-gap", "live"),
+    *("agents", "studies", "tuning", "watch", "cluster", "gymnasium", "api", "architecture", "dependencies"),
 )
 """Pages in the order of the story."""
 

@@ -32,7 +32,7 @@ def as_in_a_new_process() -> Iterator[None]:
         registry._registered.update(kinds)
 
 
-@pytest.mark.parametrize("page", ["robots.md", "gymnasium.md"])
+@pytest.mark.parametrize("page", ["robots.md", "own-robots.md", "gymnasium.md"])
 def test_the_examples_run(page: str, tmp_path, monkeypatch, capsys) -> None:
     monkeypatch.chdir(tmp_path)
     write_synthetic_series(0, "recordings", sessions=2, interval_min=140)

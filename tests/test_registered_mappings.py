@@ -29,7 +29,7 @@ from animat.training.specification import Training
 from synthetic_recordings import write_synthetic_series
 from test_training import SMALL, timeline_of
 
-DOCS = Path(__file__).parents[1] / "docs" / "robots.md"
+DOCS = Path(__file__).parents[1] / "docs" / "own-robots.md"
 STEEP = "my_package.mappings:Steep"
 
 

@@ -48,7 +48,7 @@ from animat.training.specification import Training
 from synthetic_recordings import write_synthetic_series
 from test_training import SMALL, timeline_of
 
-DOCS = Path(__file__).parents[1] / "docs" / "robots.md"
+DOCS = Path(__file__).parents[1] / "docs" / "own-robots.md"
 ROVER = "my_package.robots:Rover"
 
 
@@ -397,7 +397,7 @@ def test_it_is_a_gymnasium_environment_and_is_drawn_where_it_can_be(package: Pat
     with pytest.raises(InvalidArgument, match="rover has no method `draw`"):
         gymnasium.make("animat:Animat/Robot-v0", robot=ROVER, render_mode="rgb_array")
     for make in (gymnasium.make, gymnasium.make_vec):
-        with pytest.raises(InvalidArgument, match=r"robot: expected one of .*, got ''"):
+        with pytest.raises(InvalidArgument, match=r"robot: expected a name, as in .* robot='arm'\), got none"):
             make("animat:Animat/Robot-v0")
 
     def drawing(returned: str) -> Callable[[], Any]:

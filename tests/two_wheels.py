@@ -8,7 +8,7 @@ from typing import Any
 
 from animat.robots.registry import REGISTRY
 
-PAGE = (Path(__file__).parents[1] / "docs" / "robots.md").read_text()
+PAGE = (Path(__file__).parents[1] / "docs" / "own-robots.md").read_text()
 (FILE,) = re.findall(r"```python\n((?:(?!```).)*class Wheels.*?)```", PAGE, re.DOTALL)
 """Of one block, whatever stands in it."""
 
