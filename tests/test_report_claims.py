@@ -18,12 +18,10 @@ from animat.errors import InvalidArgument, InvalidFile
 from animat.evaluation.statistics import compare
 from animat.neurons.fidelity import Fidelity
 from animat.recordings.findings import Finding
-from animat.report.comparisons import Pair, draw_comparisons
-from animat.report.controls import draw_controls
-from animat.report.headline import draw_headline
 from animat.report.html import Picture, Section, Table, with_links, with_minus, write_page
 from animat.report.over_time import Courses, LearningCurve, draw_learning_curves, draw_over_time, over_rounds
 from animat.report.results import ComparedReturns, ControlReturns, OverCultures, Results, Score, StudyOptimum
+from animat.report.returns import Pair, draw_comparisons, draw_controls, draw_headline
 from animat.report.style import save_figure
 from animat.robots import Cartpole
 from animat.studies.arms import arm_differences, arms_table

@@ -8,11 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from animat.report.comparisons import Pair, draw_comparisons
-from animat.report.controls import draw_controls
-from animat.report.headline import draw_headline, draw_over_cultures
 from animat.report.over_time import Courses, LearningCurve, draw_learning_curves, draw_over_time
 from animat.report.results import ControlReturns, OverCultures
+from animat.report.returns import Pair, draw_comparisons, draw_controls, draw_headline, draw_over_cultures
 from animat.studies.publishing import _describe
 from test_report_claims import ROW, score
 

@@ -78,8 +78,7 @@ def best_coupling(
 
     Differential evolution, twice for each kind, over weights from -12 to 12: once from random weights only, and once
     also with couplings closest to the robot's heuristic, if it has one. All couplings of a search have the same starts
-    and random numbers. The best of the last generations is chosen in fresh episodes. Refuses a robot that is stepped
-    outside JAX (InvalidArgument).
+    and random numbers. The best of the last generations is chosen in fresh episodes. InvalidArgument for a host robot.
 
     Source: Storn & Price 1997, doi:10.1023/A:1008202821328.
     """
@@ -168,8 +167,7 @@ class ContextGap:
 
     Attributes:
         coupling: mean return of the best coupling.
-        gap: with its interval for the episodes and the optimum's grid. None if the optimum is not above random
-            stimuli, or with one episode.
+        gap: with its interval for episodes and grid; None for one episode, or an optimum not above random stimuli.
         best_known: mean return of the best known agent, which replaces the optimum; None if the optimum is known.
         highest: if it is not, the highest possible return of an episode.
     """

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float64, Int
 from animat.environment import Environment, Neurons
 from animat.errors import InvalidArgument
 from animat.evaluation.rollouts import Actor, trace
-from animat.evaluation.statistics import CONFIDENCE, Interval
+from animat.evaluation.statistics import Interval, interval_of_mean
 from animat.robots.base import capability
 
 EPISODES = 64
@@ -57,10 +57,7 @@ def goal_information(
     with s a state of each episode at a random iteration, and g the goals of the other episodes, each substituted for
     the state's own: sensors and all else stay the same. So goals do not depend on s, as they would if an actor had
     been moving towards its own goal. `draws` are the actions drawn at each state with each goal; 2 are enough for
-    deterministic actors.
-
-    Raises:
-        InvalidArgument: for continuous actions, or a robot whose goal cannot be switched (`Robot.with_goal_of`).
+    deterministic actors. Raises InvalidArgument for continuous actions, or a robot without `with_goal_of`.
     """
     switch = capability(environment.robot, "with_goal_of")
     if environment.n_actions is None:
@@ -96,8 +93,7 @@ def conditional_information(
 ) -> Float64[np.ndarray, " states"]:
     """H(A) - E_g H(A | g) at each state in bits, corrected for few draws and few goals.
 
-    The entropy of the actions (from 0 on) with one goal is Miller and Madow's; that of the mixture of goals is a
-    jackknife over goals.
+    The entropy of the actions (from 0 on) with one goal is Miller and Madow's; that of all goals a jackknife over them.
 
     Source: Miller 1955, in Information Theory in Psychology, 95; Efron & Stein 1981, doi:10.1214/aos/1176345462.
     """
@@ -108,17 +104,6 @@ def conditional_information(
     entropy = goals * _entropy(mixture) - (goals - 1) * _entropy(without).mean(axis=1)
     with_goal = _entropy(shares) + ((shares > 0).sum(axis=-1) - 1) / (2 * draws * np.log(2))
     return np.asarray(entropy - with_goal.mean(axis=1))
-
-
-def interval_of_mean(samples: Float64[np.ndarray, " samples"]) -> Interval:
-    """The mean with its interval by Student's t; infinite for one sample."""
-    from scipy.stats import t
-
-    mean, n = float(samples.mean()), len(samples)
-    if n < 2:
-        return Interval(mean, -np.inf, np.inf, CONFIDENCE)
-    half = float(t.ppf((1 + CONFIDENCE) / 2, n - 1) * samples.std(ddof=1) / np.sqrt(n))
-    return Interval(mean, mean - half, mean + half, CONFIDENCE)
 
 
 def _plug_in(actions: Int[np.ndarray, "states goals draws"], n_actions: int) -> Float64[np.ndarray, " states"]:

@@ -12,9 +12,9 @@ from animat.columns import align_columns
 from animat.environment import Animat, Environment, Neurons
 from animat.errors import InvalidArgument
 from animat.evaluation.controls import Control, interventions_of
-from animat.evaluation.information import DRAWS, GoalInformation, goal_information, interval_of_mean
+from animat.evaluation.information import DRAWS, GoalInformation, goal_information
 from animat.evaluation.rollouts import Networks, Traces, trace
-from animat.evaluation.statistics import Interval
+from animat.evaluation.statistics import Interval, interval_of_mean
 from animat.progress import Progress, Silent
 from animat.records import as_json
 from animat.tables import briefly

@@ -27,8 +27,7 @@ class Landings(NamedTuple):
         rows: first of the rows around the next state; the same for all nodes of a row, as the first coordinate does not
             influence how the others change.
         row_places: distances from that row in steps.
-        nodes: first of the nodes along the row; `ENDED` where the task ended, `ENDS_NEXT` where the next iteration will
-            end it.
+        nodes: first of the nodes along the row; `ENDED` where the task ended, `ENDS_NEXT` where the next one ends it.
         places: distances from that node in steps; for `ENDS_NEXT` the reward of the next iteration.
         rewards: of the iteration.
     """

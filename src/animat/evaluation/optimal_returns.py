@@ -192,10 +192,9 @@ def optimal_returns(
         episodes: of random stimuli, of the best coupling, and of the optimum's controller.
         resamples: of the responses, for the optimum's interval (`WellSampled.with_interval`).
         seed: decides every random draw.
-        progress: what to report to; optima, their intervals, and couplings take about as long each.
+        progress: optima, their intervals, and couplings take about as long each.
 
-    Raises:
-        UnusableData: if no condition has 30 non-burst responses.
+    Raises UnusableData if no condition has 30 non-burst responses.
     """
     enough, left_out = with_enough_samples(responses)
 

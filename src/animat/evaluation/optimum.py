@@ -52,8 +52,7 @@ class Optimum:
         without_clock: mean return of the same controller if it always acts as if the whole episode lay ahead: what is
             achievable without knowing the time, like a policy. A better one may exist, not above `value`.
         episodes: in which both were measured; 0 if the controller was not run.
-        interval: of the value, given the number of responses (`animat.evaluation.optimal_returns`); None if it was not
-            computed.
+        interval: of the value, given the number of responses (`WellSampled.with_interval`); None if not computed.
         left_out: conditions with too few responses, with their number.
     """
 
@@ -131,8 +130,7 @@ def best_returns(
     have a cost (`animat.wrappers.TrialCosts`), r is the reward less the cost of a. With memory, s also contains the
     class of the history (`commands_after`). V is stored at the nodes of a grid and interpolated by cubic polynomials
     along each axis, so the value is an approximation; `grid_error` shows how good. The controller that takes the
-    maximising action, run on the environment itself, gives an achievable return, which exceeds the true optimum only by
-    chance.
+    maximising action, run on the environment, gives an achievable return: it exceeds the true optimum only by chance.
 
     Args:
         cases: environments, all of the same robot, each with its simulator (None without neurons).
@@ -140,11 +138,9 @@ def best_returns(
         resolution: factor for the steps of the grid along each axis; 0.6 is fast and coarse.
         episodes: of the controller; 0: it is not run, which is faster.
         seed: decides every random draw.
-        progress: what to report to.
 
     Raises:
-        InvalidArgument: for no cases, a wrapper or a subclass whose effect is not known, a robot without a grid, or a
-            number that is not positive.
+        InvalidArgument: for no cases, an environment of unknown effect, a robot without a grid, or an invalid number.
         Mismatch: for cases of different robots.
     """
     if not cases:

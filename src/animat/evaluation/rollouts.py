@@ -200,8 +200,7 @@ def roll_out(
         seed: decides every random draw, together with an actor's place.
         alike: whether all actors get the same random numbers, so that only their actions differ.
 
-    Raises:
-        InvalidArgument: for fewer than one episode or more than fit, or a seed of more than 32 bits.
+    Raises InvalidArgument for fewer than one episode or more than fit, or a seed of more than 32 bits.
     """
     n_actors = actors.n_actors
     check_at_once("episodes", episodes, n_actors)

@@ -79,13 +79,8 @@ def compare(first: ArrayLike, second: ArrayLike) -> Comparison:
 
         V(t) = t (1 - t) (1 + k ((1 - t) / (2 - t) + t / (1 + t))) / n_1 n_2,    k = (n_1 + n_2) / 2 - 1
 
-    As V is that of the assumed share, the interval has a width even if all pairs are won.
-
-    Args:
-        first, second: one number per policy, such as its mean return.
-
-    Raises:
-        InvalidArgument: for an empty group, or numbers that are not finite.
+    As V is that of the assumed share, the interval has a width even if all pairs are won. A group has one number per
+    policy, such as its mean return; InvalidArgument for an empty one, or numbers that are not finite.
 
     Source: Mann and Whitney 1947, doi:10.1214/aoms/1177730491; Newcombe 2006, doi:10.1002/sim.2324; the paper's table
         of comparisons.
@@ -138,14 +133,8 @@ def interquartile_mean(samples: ArrayLike, *, within: tuple[float, float] = (-ma
 
         t_(h-1) s sqrt((n - 1) / (h (h - 1)))
 
-    With fewer than two samples in the middle it is infinite.
-
-    Args:
-        samples: numbers, shape (samples,).
-        within: the lowest and the highest possible number, which limit the interval.
-
-    Raises:
-        InvalidArgument: for no samples, or numbers that are not finite.
+    With fewer than two samples in the middle it is infinite. `within` are the lowest and the highest possible number,
+    which limit it. Raises InvalidArgument for no samples, or numbers that are not finite.
 
     Source: Agarwal et al. 2021, arXiv:2108.13264 (rliable); the interval: Tukey and McLaughlin 1963, Sankhya A 25, 331.
     """
@@ -184,9 +173,7 @@ def normalised_score(policy: float, random: float, optimum: float) -> float:
     """A policy's return on the scale from random to optimal: (policy - random) / (optimum - random).
 
     0 is as good as random and 1 the optimum (`animat.evaluation.optimum`), which a measured mean can exceed by chance.
-
-    Raises:
-        InvalidArgument: if the optimum is not above the random policy: nothing can be learned.
+    Raises InvalidArgument if the optimum is not above the random policy: nothing can be learned.
     """
     if not optimum > random:
         raise InvalidArgument(
@@ -198,6 +185,15 @@ def normalised_score(policy: float, random: float, optimum: float) -> float:
 def standard_error(samples: Float64[np.ndarray, " samples"]) -> float:
     """The standard error of the mean; NaN for one sample."""
     return float(samples.std(ddof=1) / math.sqrt(len(samples))) if len(samples) > 1 else math.nan
+
+
+def interval_of_mean(samples: Float64[np.ndarray, " samples"]) -> Interval:
+    """The mean with its 95 % interval by Student's t; infinite for one sample."""
+    from scipy.stats import t
+
+    mean, n = float(samples.mean()), len(samples)
+    half = float(t.ppf((1 + CONFIDENCE) / 2, n - 1) * samples.std(ddof=1) / math.sqrt(n)) if n > 1 else math.inf
+    return Interval(mean, mean - half, mean + half, CONFIDENCE)
 
 
 def _samples(name: str, values: ArrayLike) -> Float64[np.ndarray, " samples"]:
@@ -213,12 +209,10 @@ def _samples(name: str, values: ArrayLike) -> Float64[np.ndarray, " samples"]:
 
 
 def _exact_p(a: Float64[np.ndarray, " n"], b: Float64[np.ndarray, " m"]) -> float:
-    """The share of all ways to divide the pooled samples in which U is at least as far from its mean.
-
-    (scipy's exact test does not support ties, and its permutations take a second.)
-    """
+    """The share of all ways to divide the pooled samples in which U is at least as far from its mean."""
     from scipy.stats import rankdata
 
+    # scipy's exact test does not support ties, and its permutations take a second.
     # Ways are counted by the sum of the smaller group's ranks, doubled, as a tie's may be a half.
     a, b = sorted((a, b), key=len)
     ranks = np.rint(2 * rankdata(np.concatenate([a, b]))).astype(np.int64)

@@ -48,8 +48,7 @@ class Evaluation:
         context: how much of the optimum the best coupling leaves unused or, without an optimum, a lower bound of it;
             None if some conditions are left out of the optimum.
         no_optimum: why the optimum is not known, if it was requested.
-        fixed_from_min: time of the recording whose percentiles the mapping keeps, as in training; None if it uses those
-            of the simulator.
+        fixed_from_min: time of the recording whose percentiles the mapping keeps; None if it uses the simulator's.
         objectives: of the robot's goal, as texts; empty for a robot without one.
         whose_work: what the policies lose with each intervention; None if it was not requested.
         net_optimum: the optimal return of any controller less the cost of pulses, if they have a cost.

@@ -109,9 +109,8 @@ def draw_series(
 ) -> list[Path]:
     """Draw a series: `series-array`, `series-over-time`, `series-drift`; `file_format` is one of `FORMATS`.
 
-    The array is drawn if the positions of the first recording are known, the other figures if there are two recordings
-    or more. `series` may be in any order. Raises InvalidArgument for no responses, and Mismatch for recordings with
-    different conditions.
+    The array is drawn if the positions of the first recording are known, the other figures for two recordings or more.
+    `series` may be in any order. InvalidArgument for no responses, Mismatch for recordings with different conditions.
     """
     if not series:
         raise InvalidArgument("series: expected the responses of at least one recording, got none")

@@ -216,8 +216,7 @@ class ContextRow:
 
     Attributes:
         best_known: if there is no optimal return, that of the best of the policies and the heuristic.
-        gap, score: the context gap of the task and the context score of the policies, on the simulator; lower bounds if
-            there is no optimal return.
+        gap, score: the context gap of the task and the policies' context score on the simulator; may be lower bounds.
         bits: goal information; None for a robot with only one goal.
     """
 

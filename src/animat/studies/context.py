@@ -309,9 +309,7 @@ def _row(culture: int, robot: str, evaluation: dict[str, Any], session: dict[str
         score_low_95=score.get("low"),
         score_high_95=score.get("high"),
         bits=None if information is None else information["bits"]["value"],
-        measured_random=measured.get("random"),
-        measured_heuristic=measured.get("heuristic"),
-        measured_coupling=measured.get("coupling"),
+        **{f"measured_{name}": measured.get(name) for name in ("random", "heuristic", "coupling")},
         # The first row is that of all policies, or of the only one.
         measured_policies=session["rows"][0]["measured"],
         predicted_policies=session["rows"][0]["predicted"],

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import os
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -14,10 +13,9 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float64
 
 from animat.errors import AnimatError, counted
-from animat.evaluation.statistics import CONFIDENCE
+from animat.evaluation.statistics import interval_of_mean
 from animat.execution.cluster import Cluster
 from animat.execution.gpu import find_gpu
 from animat.execution.jobs import expect_workers
@@ -25,9 +23,9 @@ from animat.execution.pinned import PinnedProcesses
 from animat.folders import expect_no_other
 from animat.process import own_cores
 from animat.progress import Progress, Silent
-from animat.report.headline import draw_over_cultures
 from animat.report.html import Section, cell, columns_of, picture_of, table_of, write_page
 from animat.report.results import ComparedReturns, OverCultures, Results, Score
+from animat.report.returns import draw_over_cultures
 from animat.report.style import save_formats
 from animat.studies.arms import arm_differences, arms_table, summarise_arms
 from animat.studies.folder import REPORT, RESULTS
@@ -85,8 +83,7 @@ def run_over_cultures(
     """Run or resume a study of many cultures: each culture as in `run_study`, one per core at a time.
 
     Recording a culture uses one core only; meanwhile the others do jobs of other cultures. If the study of a culture
-    fails, the others continue, and the failure is reported at the end. More cultures may be added later; finished jobs
-    are not run again.
+    fails, the others continue, and the failure is reported at the end. More cultures may be added later.
 
     Arguments and errors are those of `run_study`, for a study with `seeds` or `folders` in its culture; AnimatError is
     raised if the study of every culture failed, with the error of each.
@@ -106,25 +103,21 @@ def run_over_cultures(
             }
             finished, failed = _run_side_by_side(runs, min(at_once, MOST_AT_ONCE), shared, progress or Silent())
         _write_manifest(folder, studies, failed)
-        return _write_tables(folder, finished, failed)
+        if not finished:
+            raise AnimatError("; ".join(f"{name}: {error}" for name, error in failed.items()))
+        results = {name: read_typed(each.folder / RESULTS, Results) for name, each in finished.items()}
+        comparisons = {name: each.comparisons for name, each in results.items()}
+        summary = over_cultures(list(comparisons.values()))
+        scores = {name: each.scores for name, each in results.items()}
+        write_named_records(folder / COMPARISONS, comparisons, ComparedReturns, "culture")
+        write_records(folder / SUMMARY, OverCultures, summary)
+        write_named_records(folder / SCORES, scores, Score, "culture")
+        parquet = write_parquet((folder / SCORES).with_suffix(".parquet"), scores, Score, "culture")
+    return CulturesRun(folder, finished, failed, comparisons, summary, parquet)
 
 
 def _write_manifest(folder: Path, names: Iterable[str], failed: Mapping[str, str]) -> None:
     write_whole(folder / MANIFEST, json.dumps({"cultures": list(names), "failed": failed}, indent=1) + "\n")
-
-
-def _write_tables(folder: Path, finished: dict[str, StudyRun], failed: dict[str, str]) -> CulturesRun:
-    if not finished:
-        raise AnimatError("; ".join(f"{name}: {error}" for name, error in failed.items()))
-    results = {name: read_typed(each.folder / RESULTS, Results) for name, each in finished.items()}
-    comparisons = {name: each.comparisons for name, each in results.items()}
-    summary = over_cultures(list(comparisons.values()))
-    scores = {name: each.scores for name, each in results.items()}
-    write_named_records(folder / COMPARISONS, comparisons, ComparedReturns, "culture")
-    write_records(folder / SUMMARY, OverCultures, summary)
-    write_named_records(folder / SCORES, scores, Score, "culture")
-    parquet = write_parquet((folder / SCORES).with_suffix(".parquet"), scores, Score, "culture")
-    return CulturesRun(folder, finished, failed, comparisons, summary, parquet)
 
 
 @contextmanager
@@ -196,7 +189,7 @@ def over_cultures(comparisons: Sequence[Sequence[ComparedReturns]]) -> tuple[Ove
     found = []
     for rows in zip(*comparisons, strict=True):
         first, second = np.array([row.mean_first for row in rows]), np.array([row.mean_second for row in rows])
-        low, high = interval_of_mean(second - first) if len(rows) > 1 else (None, None)
+        difference = interval_of_mean(second - first)
         found.append(
             OverCultures(
                 comparison=rows[0].comparison,
@@ -204,23 +197,15 @@ def over_cultures(comparisons: Sequence[Sequence[ComparedReturns]]) -> tuple[Ove
                 cultures=len(rows),
                 mean_first=float(first.mean()),
                 mean_second=float(second.mean()),
-                difference=float((second - first).mean()),
-                low_95=low,
-                high_95=high,
+                difference=difference.value,
+                low_95=difference.low if len(rows) > 1 else None,
+                high_95=difference.high if len(rows) > 1 else None,
                 larger_in=int((second > first).sum()),
                 holds_in=sum(row.outcome == SECOND for row in rows),
                 tested=sum(row.outcome != TOO_FEW for row in rows),
             )
         )
     return tuple(found)
-
-
-def interval_of_mean(values: Float64[np.ndarray, " cultures"]) -> tuple[float, float]:
-    """The 95 % interval of the mean of two or more values by Student's t."""
-    from scipy.stats import t
-
-    half = t.ppf((1 + CONFIDENCE) / 2, len(values) - 1) * values.std(ddof=1) / math.sqrt(len(values))
-    return float(values.mean() - half), float(values.mean() + half)
 
 
 def write_cultures_page(study: Study, found: CulturesRun) -> Path:

@@ -49,12 +49,9 @@ COMPARISONS = (
 
 @checked_arguments
 def paper_study(culture_seed: int = 1, seed: int = 1, *, quick: bool = False) -> Study:
-    """The paper's study on a virtual culture.
+    """The paper's study on the virtual culture of a seed; `seed` decides every draw of training and evaluation.
 
-    Args:
-        culture_seed: of the virtual culture.
-        seed: decides every draw of training and evaluation.
-        quick: all steps with fewer policies, iterations and recordings: a first look, not a result.
+    `quick`: all steps with fewer policies, iterations and recordings: a first look, not a result.
     """
     study = Study(
         title="The paper's study on a virtual culture",

@@ -21,13 +21,12 @@ from animat.recordings.reading import read_recordings
 from animat.recordings.recording import Recording
 from animat.records import read_record
 from animat.report.array import draw_array, rates_of_sites
-from animat.report.comparisons import Pair, draw_comparisons
-from animat.report.controls import draw_controls
 from animat.report.drift import PERCENTILES, Drift, draw_drift, drift_of
 from animat.report.episodes import draw_frames, draw_paths
 from animat.report.over_time import Courses, LearningCurve, draw_learning_curves, draw_over_time, over_rounds
 from animat.report.response_histograms import draw_burst_separation, draw_response_histograms, draw_responses_over_time
 from animat.report.results import ComparedReturns, ControlReturns, Results
+from animat.report.returns import Pair, draw_comparisons, draw_controls
 from animat.report.spikes import draw_psth, draw_raster
 from animat.report.style import save_formats
 from animat.responses.psth import PostStimulusHistogram, post_stimulus_histogram, spontaneous_rate

@@ -14,9 +14,9 @@ from animat.evaluation.statistics import p_of_u
 from animat.neurons.fidelity import Fidelity
 from animat.neurons.timeline import load_timeline
 from animat.progress import Progress
-from animat.report.headline import draw_headline
 from animat.report.html import Picture, Section, Table, cell, picture_of, write_page
 from animat.report.results import ComparedReturns, ControlReturns, Results, Score
+from animat.report.returns import draw_headline
 from animat.report.style import save_figure, save_formats
 from animat.responses.responses import Responses
 from animat.studies import report_tables

@@ -56,7 +56,6 @@ def run_study(
     files of the same recordings have their own identifiers and dates.
 
     Args:
-        study: the specification.
         folder: for all files; created if it is missing.
         base: folder to which the specification's file names are relative.
         workers: number of processes, each on its own core; None: one per core. Not with an executor.

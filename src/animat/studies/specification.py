@@ -146,8 +146,7 @@ class Arm:
             custom mappings); `"none"` is the baseline without neurons.
         shadowing: whether simulators are refreshed during training; `"drawn"`: each episode draws one of them.
         delivery: `"shuffled"`: the delivered stimulus is drawn at random in training and evaluation (the control).
-        percentiles: of the mapping: `"moving"` with the simulator, or fixed by the `"first"` recording. Both have their
-            defaults without neurons.
+        percentiles: of the mapping: `"moving"` with the simulator, or fixed by the `"first"` recording.
         trained: false for policies as they are before training.
     """
 
@@ -160,7 +159,7 @@ class Arm:
 
     def __post_init__(self) -> None:
         if not self.through_neurons:
-            # Arms that differ in nothing else share controls and an optimum.
+            # Both have their defaults: arms that differ in nothing else share controls and an optimum.
             object.__setattr__(self, "delivery", "chosen")
             object.__setattr__(self, "percentiles", "moving")
             return
@@ -229,6 +228,8 @@ class Compared:
 class Study:
     """Everything that decides a study's results, except for the recordings in files.
 
+    InvalidArgument names the setting, what was expected and what came.
+
     Attributes:
         title: of the report.
         culture, simulators: the recordings, and how responses are read from them and fitted.
@@ -243,9 +244,6 @@ class Study:
         optimum_episodes: episodes in which the optimal controller's return is checked.
         algorithm: settings of `animat.training.settings.SAC` that replace its defaults.
         paper: whether the paper's results are printed with comparisons of the same name and robot.
-
-    Raises:
-        InvalidArgument: naming the setting, what was expected and what came.
     """
 
     title: str = "Study"

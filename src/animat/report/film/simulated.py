@@ -43,8 +43,7 @@ def scene_of_policies(
         span_s: start and end of the film; None: the first minute.
         seed: decides every random draw.
 
-    Raises InvalidArgument for a span that begins after the last episode, conditions that are not the policies', or a
-    seed of more than 32 bits.
+    InvalidArgument for a span after the last episode, other conditions than the policies', or a seed above 32 bits.
     """
     check_seed(seed)
     first = first_of_alike(policies, _ALIKE, "film it alone")
