@@ -68,7 +68,7 @@ def test_a_task_that_a_reflex_does_has_no_score() -> None:
     assert not row.needs_context and row.score is None
     assert row.gap == pytest.approx(0.0)
     returned = row.coupling
-    assert describe_reflexes([row]) == [
+    assert list(describe_reflexes([row])) == [
         f"cartpole, taught, at 0 min: the best reflex returns {returned:.1f}; the task needs no more than that."
     ]
     (unsure,) = describe_reflexes([replace(row, gap_high_95=0.06)])

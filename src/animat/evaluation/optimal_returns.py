@@ -216,8 +216,6 @@ def optimal_returns(
         random = roll_out(*case, Uniform(), episodes=episodes, seed=seed).returns[0]
         coupling = best_coupling(*case, seed=seed, progress=Part(searching, len(optima), 1, n))
         of_coupling = roll_out(*case, coupling, episodes=episodes, seed=seed).returns[0]
-        gap = context_gap(of_coupling, random, optimum)
-        optima.append(
-            OptimalReturn(robot.name, mapping.name, float(random.mean()), standard_error(random), optimum, gap)
-        )
+        known = float(random.mean()), standard_error(random), optimum, context_gap(of_coupling, random, optimum)
+        optima.append(OptimalReturn(robot.name, mapping.name, *known))
     return tuple(optima)

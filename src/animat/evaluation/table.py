@@ -308,6 +308,8 @@ class _World:
     minute: float | None = None
     fixed_from_min: float | None = None
     findings: tuple[Finding, ...] = ()
+    pulses_of_trials: tuple[float, ...] | None = None
+    """Electrode pulses per trial of each condition, if the electrodes are known."""
 
     @classmethod
     def of(
@@ -329,11 +331,13 @@ class _World:
         simulator = timeline.with_percentiles(first.percentiles).at(minute)
         animat = Animat(body, first.mapping, len(timeline.conditions))
         environment: Environment[Any] = NeuralObservation(animat) if first.neural_observation else animat
-        return cls(first, environment, simulator, timeline, minute, fixed_from_min, findings)
+        n_pulses = 1 if first.presentation is None else first.presentation.pulses
+        of_trials = electrode_pulses(first.conditions, n_pulses)
+        return cls(first, environment, simulator, timeline, minute, fixed_from_min, findings, of_trials)
 
     def row_of(self, control: Control, *, episodes: int, seed: int) -> Row:
         ran = control.run(self.environment, self.simulator, episodes=episodes, seed=seed)
-        of_trials = self._electrode_pulses()
+        of_trials = self.pulses_of_trials
         pulses = None if of_trials is None else ran.presented @ of_trials * (control.delivery != "silent") / episodes
         return Row(control.name, control.meaning, ran, control.delivery != "chosen", pulses, self.first.pulse_cost)
 
@@ -351,16 +355,11 @@ class _World:
 
     def net_optimum(self, resolution: float, seed: int) -> Optimum | None:
         """The optimal return less the cost of pulses; None if they have no cost."""
-        cost, of_trials = self.first.pulse_cost, self._electrode_pulses()
+        cost, of_trials = self.first.pulse_cost, self.pulses_of_trials
         if not cost or of_trials is None:
             return None
         costing = TrialCosts(unwrapped(self.environment), tuple(cost * count for count in of_trials))
         return best_return(costing, self.simulator, resolution=resolution, seed=seed)
-
-    def _electrode_pulses(self) -> tuple[float, ...] | None:
-        """Electrode pulses per trial of each condition, if there are neurons and the electrodes are known."""
-        pulses = 1 if self.first.presentation is None else self.first.presentation.pulses
-        return electrode_pulses(self.first.conditions, pulses) if self.simulator is not None else None
 
 
 def _context(rows: Sequence[Row], optimum: Optimum | None, largest_return: float) -> ContextGap | None:

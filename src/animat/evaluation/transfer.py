@@ -133,24 +133,22 @@ def expect_conditions(policy: Policy, conditions: Sequence[Condition], readouts:
         )
 
 
-def timeline_differences(policy: Policy, timeline: SimulatorTimeline) -> tuple[Finding, ...]:
+def timeline_differences(policy: Policy, timeline: SimulatorTimeline) -> Iterator[Finding]:
     """Differences between simulators and those that a policy was trained on; errors as in `expect_conditions`."""
     expect_conditions(policy, timeline.conditions, timeline.readouts)
-    findings = []
     if policy.window_ms != timeline.window_ms:
         trained, these = describe_window(policy.window_ms), describe_window(timeline.window_ms)
         message = f"the policies were trained on responses {trained}, but these are {these}"
-        findings.append(Finding("other-window", "warning", message))
-    findings += other_simulator(policy.fitted, timeline.fitted)
-    findings += other_culture(policy.culture, timeline.culture)
+        yield Finding("other-window", "warning", message)
+    yield from other_simulator(policy.fitted, timeline.fitted)
+    yield from other_culture(policy.culture, timeline.culture)
     first_min = next(iter(policy.recorded_at_min), None)
     if policy.percentiles == "first" and first_min not in (None, float(timeline.start_min[0])):
         message = (
             f"the policies' percentiles were fixed from the recording at {in_min(first_min)}, which is not the first "
             f"of these: here they are fixed from {in_min(timeline.start_min[0])}"
         )
-        findings.append(Finding("other-percentiles", "warning", message))
-    return tuple(findings)
+        yield Finding("other-percentiles", "warning", message)
 
 
 def loop_differences(policy: Policy, timeline: SimulatorTimeline, minute: float) -> Iterator[Finding]:

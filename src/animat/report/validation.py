@@ -36,9 +36,7 @@ def validation_text(name: str, validation: Validation) -> str:
         )
     lines.append(f"  {'recorded':<47}{v.autocorrelation[0]:>8.2f}{f'{v.run_length:.2f}':>25}")
     gains = [("conditions bring", v.gain("empirical", MARGINAL)), ("memory brings", v.gain("memory", "empirical"))]
-    lines.append(
-        "  " + "; ".join(f"{part} {gain.value:.3f} +- {gain.error:.3f} bits per trial" for part, gain in gains)
-    )
+    lines.append("  " + "; ".join(f"{of} {gain.value:.3f} +- {gain.error:.3f} bits per trial" for of, gain in gains))
     width = max(len("condition"), *map(len, v.labels))
     lines += ["", f"  {'condition':<{width}}  {'responses':>13}  {'median x (Hz)':>16}  P(x >= P50) {v.kind}, recorded"]
     for c, label in enumerate(v.labels):

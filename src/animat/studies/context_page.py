@@ -97,9 +97,7 @@ def _whose_work(study: ContextStudy, found: ContextRun) -> Section:
         WHOSE_WORK,
     )
     names = dict.fromkeys(name for each in lost.values() for name in each)
-    rows = tuple(
-        (name, *(float(np.mean(each[name])) if name in each else None for each in lost.values())) for name in names
-    )
+    rows = tuple((name, *(float(np.mean(of[name])) if name in of else None for of in lost.values())) for name in names)
     mean = "Mean over cultures of the return lost, as a fraction of the policies' advantage over random stimuli."
     table = Table("Return lost", ("", *lost), rows, note=mean, beside=WHOSE_WORK)
     return Section("Whose work is it?", note, pictures=(picture,), tables=(table,))

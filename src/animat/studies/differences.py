@@ -81,10 +81,8 @@ def _culture_decisions(study: Study) -> Iterator[tuple[str, str]]:
 
 def _simulator_decisions(study: Study, series: Sequence[Responses]) -> Iterator[tuple[str, str]]:
     simulators = study.simulators
-    yield (
-        "Bursts",
-        f"In the paper Otsu's threshold is always applied. {_burst_rule(simulators.burst_threshold, series)}",
-    )
+    bursts = _burst_rule(simulators.burst_threshold, series)
+    yield "Bursts", f"In the paper Otsu's threshold is always applied. {bursts}"
     paper = "The paper's 20 bins range from 0 to 120 Hz, chosen for its culture. "
     if simulators.kind == "empirical":
         yield "Histogram", paper + "Here there are no bins: one of the measured responses is drawn."

@@ -64,9 +64,7 @@ def episode_rows(
 def write_episodes(path: Path, parts: Iterable[DataFrame]) -> Path:
     """Write parts of the table to one file, each column as an array; atomic, and always the same bytes."""
     table = pd.concat(parts)
-    columns = {
-        name: column.to_numpy(str if pd.api.types.is_string_dtype(column) else None) for name, column in table.items()
-    }
+    columns = {name: of.to_numpy(str if pd.api.types.is_string_dtype(of) else None) for name, of in table.items()}
     return write_arrays(path, columns)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, final
@@ -56,15 +56,13 @@ def key_of(of: Arm | StudyOptimum, at_min: float) -> tuple[str, str, float]:
     return of.mapping, of.percentiles, 0.0 if of.mapping == "none" else at_min
 
 
-def missing_capabilities(study: Study) -> list[str]:
+def missing_capabilities(study: Study) -> Iterator[str]:
     """A sentence for each thing that a robot of the study cannot do, and that the study therefore lacks."""
-    messages: list[str] = []
     for robot in dict.fromkeys(spec.robot() for spec in study.robots):
         lacks = lacking(robot)
         if (why_not := why_no_grid(robot)) is not None:
             lacks.setdefault("value_grid", f"no optimal return: {why_not}")
-        messages += lacks.values()
-    return messages
+        yield from lacks.values()
 
 
 @final
@@ -107,6 +105,7 @@ class FindOptima(StudyTask):
         evaluated = {(arm.kind, at) for arm in arms for at in study.minutes_of(arm, first, last)}
         bootstrapped = [each for each in requests if each.counted and (each.kind.kind, each.at_min) in evaluated]
         done, steps = 0, sum(map(len, batches.values())) + len(bootstrapped)
+        coarser = STEPS_BOOTSTRAPPED * resolution
         for batch in batches.values():
             part = Part(progress, done, len(batch), steps)
             cases = [each.case for each in batch if each.case is not None]
@@ -116,9 +115,7 @@ class FindOptima(StudyTask):
             done += len(batch)
         for each in bootstrapped:
             assert each.counted is not None and each.optimum is not None
-            each.optimum = each.counted.with_interval(
-                each.optimum, resolution=STEPS_BOOTSTRAPPED * resolution, seed=study.seed
-            )
+            each.optimum = each.counted.with_interval(each.optimum, resolution=coarser, seed=study.seed)
             done += 1
             progress.update(done, steps, "intervals")
         return [write_typed(file, [each.to_row(self.spec.name) for each in requests])]

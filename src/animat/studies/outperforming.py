@@ -77,12 +77,9 @@ def compare_with_reflex(
             )
 
 
-def describe_reflexes(rows: Iterable[ReflexComparison]) -> list[str]:
+def describe_reflexes(rows: Iterable[ReflexComparison]) -> Iterator[str]:
     """A sentence for each row whose gap is known."""
-    sentences = []
-    for row in rows:
-        if row.gap is None:
-            continue
+    for row in (row for row in rows if row.gap is not None):
         if row.needs_context:
             score = "" if row.score is None else f"; the policies' context score is {row.score:.2f}"
             needs = f"the task needs more{score}"
@@ -91,8 +88,7 @@ def describe_reflexes(rows: Iterable[ReflexComparison]) -> list[str]:
         else:
             needs = "whether the task needs more is not known"
         where = f"{row.robot}, {row.arm}, at {row.at_min:g} min"
-        sentences.append(f"{where}: the best reflex returns {row.coupling:.1f}; {needs}.")
-    return sentences
+        yield f"{where}: the best reflex returns {row.coupling:.1f}; {needs}."
 
 
 def _ends(interval: Interval | None) -> tuple[float | None, float | None, float | None]:

@@ -70,11 +70,8 @@ class Publish(StudyTask):
         if study.culture.kind == "files":
             settings += ", provided that the files are at the same paths relative to study.toml"
         sections += [_findings(results), Section("How it was done", (f"{settings}.",), verbatim=study_to_toml(study))]
-        return [
-            *drawn,
-            narrow,
-            write_page(folder / REPORT, study.title, _lead(study), sections, _colophon(study, manifest)),
-        ]
+        page = write_page(folder / REPORT, study.title, _lead(study), sections, _colophon(study, manifest))
+        return [*drawn, narrow, page]
 
 
 def _lead(study: Study) -> str:
@@ -187,9 +184,8 @@ def _compared(study: Study, results: Results) -> Section:
         "not mean that there is none. The effect is the rank-biserial correlation, +1 where every policy of the second "
         "arm is better, with Newcombe's 95 % interval."
     )
-    return Section(
-        "Comparisons", (method,), tables=(report_tables.comparisons_table(rows), report_tables.returns_table(rows))
-    )
+    tables = report_tables.comparisons_table(rows), report_tables.returns_table(rows)
+    return Section("Comparisons", (method,), tables=tables)
 
 
 def _as_in_paper(rows: Sequence[ComparedReturns]) -> str:
@@ -248,9 +244,7 @@ def _facts_of_culture(series: Sequence[Responses]) -> dict[str, str]:
     }
 
 
-def _pictures(
-    folder: Path, of: str, captions: Mapping[str, Caption], facts: Mapping[str, object]
-) -> tuple[Picture, ...]:
+def _pictures(folder: Path, of: str, captions: Mapping[str, Caption], facts: Mapping[str, str]) -> tuple[Picture, ...]:
     """The figures that were drawn; `facts` fill the placeholders in captions."""
     pictures = []
     for name, (title, caption, numbers) in captions.items():
@@ -286,9 +280,7 @@ def _controls(study: Study, results: Results) -> Section:
     )
 
 
-def _differences(
-    study: Study, results: Results, kept: Mapping[float, Fidelity], series: Sequence[Responses]
-) -> Section:
+def _differences(study: Study, results: Results, kept: dict[float, Fidelity], series: Sequence[Responses]) -> Section:
     rows = [row for row in results.comparisons if row.paper_p is not None]
     lost = {at_min: of.largest_loss for at_min, of in kept.items()}
     differing = differing_comparisons(rows, lost)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import final
@@ -123,15 +124,13 @@ def _write_responses(path: Path, series: list[Responses]) -> Path:
     return write_table(path, [*head, *(f"rate_hz of {name}" for name in names)], rows)
 
 
-def _moved(study: Study, start_min: list[float]) -> list[Finding]:
+def _moved(study: Study, start_min: list[float]) -> Iterator[Finding]:
     """A finding for each comparison at a minute at which no recording starts."""
     settled = study.at_recordings(start_min).comparisons
-    moved = []
     for old, new in zip(study.comparisons, settled, strict=True):
         if old.at_min is not None and old.at_min != new.at_min:
             text = f"{old.name} was requested at {old.at_min:g} min and is made on the recording at {new.at_min:g} min"
-            moved.append(Finding("comparison-minute", "note", text, new.at_min))
-    return moved
+            yield Finding("comparison-minute", "note", text, new.at_min)
 
 
 def read_series(study: Study, folder: Path, *, as_one: bool = False) -> list[Responses]:

@@ -143,11 +143,9 @@ def run_jobs(
     """Run the jobs of a folder that are not done, with options of `Jobs.run`; returns the CPU seconds of each."""
     left = Jobs(jobs, folder, folder / RECEIPTS, fingerprint)
     took_s: dict[str, float] = {}
-    if left.waiting:
+    if n := len(left.waiting):
         if not os.access(folder, os.W_OK):
-            raise InvalidFile(
-                f"{folder}: {len(left.waiting)} of {len(jobs)} jobs are left, but it cannot be written to"
-            )
+            raise InvalidFile(f"{folder}: {n} of {len(jobs)} jobs are left, but it cannot be written to")
         took_s = left.run(progress=progress or Silent(), **how)
     shutil.rmtree(folder / UNFINISHED, ignore_errors=True)
     return took_s

@@ -72,12 +72,9 @@ class Source:
         for file in (*self.files, *(self.folders or ())):
             if not file or not file.isprintable():
                 raise InvalidArgument(f"files: expected names of files, got {shown(file)}")
-        if self.kind == "files":
-            for each in fields(self):
-                if each.name not in ("kind", "files", "folders") and getattr(self, each.name) != each.default:
-                    raise InvalidArgument(
-                        f"{each.name}: expected only for a culture that is recorded, got kind = 'files'"
-                    )
+        for each in fields(self) if self.kind == "files" else ():
+            if each.name not in ("kind", "files", "folders") and getattr(self, each.name) != each.default:
+                raise InvalidArgument(f"{each.name}: expected only for a culture that is recorded, got kind = 'files'")
         # An invalid protocol is refused before a folder is made.
         if self.kind == "virtual":
             self.protocol()

@@ -80,7 +80,8 @@ class Frames:
                     response.dot(each.time_s, each.rate_hz, self._colours.get(each.delivered, _INK))
         command = _Strip(draw, strips[-2], time_s, (-1.0, 1.0), "command", zero=True)
         for i in range(scene.robot.n_commands if scene.robot.n_commands > 1 else 0):
-            command.name(i)
+            at = (_LEFT + 64 + 14 * i, strips[-2][0] - 3)
+            draw.text(at, f"{i + 1}", COMMANDS[i % len(COMMANDS)], _font(12), anchor="ls")
         total = _Strip(draw, strips[-1], time_s, self._totals, "return so far")
         for episode in dict.fromkeys(each.episode for each in past):
             of_it = [each for each in past if each.episode == episode]
@@ -152,11 +153,6 @@ class _Strip:
             self._draw.polygon([(x - 4, y + 6), (x, y - 1), (x + 4, y + 6)], colour)
         else:
             self._draw.circle((x, y), 3, colour)
-
-    def name(self, i: int) -> None:
-        """Draw the number of a command, in its colour."""
-        at = (_LEFT + 64 + 14 * i, self._top - 3)
-        self._draw.text(at, f"{i + 1}", COMMANDS[i % len(COMMANDS)], _font(12), anchor="ls")
 
     def steps(self, known: Sequence[tuple[float, float]], until_s: float, colour: str) -> None:
         """Draw values that each hold until the next one."""
