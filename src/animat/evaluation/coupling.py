@@ -267,8 +267,7 @@ def least_context_gap(
     The optimum is not below the return of any agent, nor below the coupling. If the coupling is above random stimuli,
     the gap grows with the optimum, so an agent in its place gives a lower bound; else the gap is at least 1. The best
     of several agents (policies and heuristics, all in `known`) is chosen by the first half of their episodes; its
-    return is that of the second half. `coupling` and `random` are returns in the same episodes, with the same starts;
-    `highest` is the highest possible return.
+    return is that of the second half. `coupling` and `random` have the same starts; `highest` is the highest possible.
     """
     half = known.shape[1] // 2 if len(known) > 1 else 0
     best = known[known[:, : max(half, 1)].mean(axis=1).argmax(), half:]

@@ -24,8 +24,7 @@ class Landings(NamedTuple):
     """Where one iteration leads, for each of a few commands and draws of the robot's noise.
 
     Attributes:
-        rows: first of the rows around the next state; the same for all nodes of a row, as the first coordinate does not
-            influence how the others change.
+        rows: first of the rows around the next state; the same for all nodes of a row (`Motion.from_grid`).
         row_places: distances from that row in steps.
         nodes: first of the nodes along the row; `ENDED` where the task ended, `ENDS_NEXT` where the next one ends it.
         places: distances from that node in steps; for `ENDS_NEXT` the reward of the next iteration.

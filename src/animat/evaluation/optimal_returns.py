@@ -63,8 +63,7 @@ class WellSampled:
 
         if left_out:
             environment, simulator = replace(environment, n_conditions=len(responses.conditions)), fit(responses, kind)
-        # Memory changes the optimum, but hardly its uncertainty: the interval is computed without, in a sixth of the
-        # time.
+        # Memory hardly changes the optimum's uncertainty: the interval is computed without, in a sixth of the time.
         spread = "histogram" if simulator.has_memory else kind
         return cls(environment, simulator, responses, left_out, lambda these: fit(these, spread))
 
@@ -112,9 +111,8 @@ class WellSampled:
 def with_enough_samples(responses: Responses) -> tuple[Responses, tuple[str, ...]]:
     """Responses to the conditions with 30 or more non-burst responses, and the other conditions, with their number.
 
-    The best of several values is likely a lucky one, so a condition with three responses promises too much. With 30 or
-    more, nine of ten intervals contain the true optimum, with 10 four of five (docs/evidence/optimal-return.md). Raises
-    UnusableData if no condition has that many.
+    The best of several values is likely a lucky one: three responses promise too much. With 30, nine of ten intervals
+    contain the true optimum, with 10 four of five (docs/evidence/optimal-return.md). UnusableData if none has as many.
     """
     n = [len(responses.rates_of(i)) for i in range(len(responses.conditions))]
     few = too_few(responses.conditions, n)

@@ -111,8 +111,7 @@ class HeuristicPolicy(Actor):
     """The action whose mean command is nearest to that of the robot's `heuristic`, which sees only the robot.
 
     Attributes:
-        actions: the environment's input for each action, shape (1, actions), for one actor; None where any command can
-            be given (without neurons, continuous ones).
+        actions: the environment's input for each action, shape (1, actions), for one actor; None for any command.
         means: the mean command of each action, the same shape, or (1, actions, commands) for several commands.
     """
 

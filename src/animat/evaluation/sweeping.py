@@ -65,8 +65,7 @@ def bellman_backup(
         (k, m) = outcomes_l(o)
 
     Each case has one layer of values or, with memory, one for each class of the history. The rows around a landing are
-    the same for all nodes of a row and for all layers. They are summed once, node by node, which is fast; what remains
-    for each node is the interpolation along the row.
+    the same for all nodes of a row and for all layers. They are summed once; each node is interpolated along the row.
 
     Args:
         values: of the next states, at the grid's nodes: row by row, and layer by layer within a row.

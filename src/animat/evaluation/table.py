@@ -221,8 +221,7 @@ def evaluate(
         progress: updated after the policies and each control, during the optimum, and before each intervention.
 
     Raises:
-        InvalidArgument: for no policies, unknown controls, fewer than one episode, interventions without neurons, or an
-            invalid `at_min`, seed or resolution.
+        InvalidArgument: for no policies, unknown controls, interventions without neurons, or a number out of range.
         Mismatch: if the policies differ from each other, from the robot or from the timeline's conditions.
     """
     alike = ("robot", "mapping", "readouts", "conditions", "commands", "percentiles", "delivery", "pulse_cost")

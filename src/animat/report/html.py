@@ -21,8 +21,7 @@ from animat.writing import write_whole
 MINUS = "\u2212"
 _DRAW_AGAIN = "; run the command again, which draws it again"
 
-# Hyphens that are minus signs: not those within words, ranges such as 2-10, options and file names, but those of
-# exponents such as 1.5e-05.
+# Hyphens that are minus signs: not in words, ranges such as 2-10, options and file names, but in 1.5e-05.
 _HYPHEN = re.compile(r"(?:(?<![\w.\-/+])-(?=\.?\d))|(?<=\de)-(?=\d)")
 
 

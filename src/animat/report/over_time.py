@@ -25,8 +25,7 @@ class LearningCurve:
     Attributes:
         iterations: done at the end of each chunk of training.
         returns: mean return of the episodes that ended by then (`over_rounds`), NaN if not known.
-        random, optimum: return of random actions and optimal return with the simulator in use in each chunk, NaN if not
-            known; None if known for no chunk.
+        random, optimum: random and optimal return with the simulator in use in each chunk, NaN or None if not known.
         within: the lowest and the highest possible return, which limit intervals.
     """
 

@@ -27,8 +27,7 @@ _MOST_ROWS, _MOST_COLUMNS, _BINS_OVER_TIME = 20, 8, 24
 def draw_response_histograms(responses: Responses, last: Responses | None = None) -> Figure:
     """Non-burst responses to every condition on a common axis, with P50, the median of all of them.
 
-    At most 16 conditions are drawn, those with the most responses; the title says so. The last recording of a series,
-    which has the same conditions, is drawn as outlines.
+    At most 16 conditions are drawn, those with the most responses. `last`, with the same conditions, is outlined.
     """
     n = [len(responses.rates_of(i)) for i in range(len(responses.conditions))]
     drawn = sorted(sorted(range(len(n)), key=lambda i: -n[i])[:_MOST_PANELS])

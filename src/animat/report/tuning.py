@@ -21,8 +21,7 @@ def draw_history(
     """One point per trial at its last mean return, by how far it was trained; the best full training so far; finals.
 
     Args:
-        trials: number of each trial, and for each rung that it reached the chunks done and the mean return; none if it
-            diverged, however far it was trained before.
+        trials: number of each, and for each rung that it reached the chunks done and the mean return; none if diverged.
         rungs: chunks done at the end of each rung; the last is the full training.
         best: number of the best trial, its mean return when retrained, and the standard error.
         own: mean return and standard error of the initial settings, retrained; None if they diverged.

@@ -57,8 +57,7 @@ class ContextStudy:
     """The specification of a context study: its tasks, its virtual cultures, and its size.
 
     Attributes:
-        cultures: seeds of virtual cultures, each recorded as it will run (`animat.stimulation.protocol`: `CLOSED_LOOP`,
-            and for robots with two commands `TWO_COMMANDS`).
+        cultures: seeds of virtual cultures, each recorded as it will run (`protocol_for`).
         robots: names of robots in JAX with one or two commands. Where a robot has no optimal return, its context gap is
             a lower bound (`animat.evaluation.coupling.least_context_gap`).
         policies: number trained for each robot and culture.

@@ -119,8 +119,7 @@ class Search:
 def importance_of(space: Space, results: Sequence[TrialResult]) -> dict[str, float]:
     """The share of each setting in the return after the first rung, the largest first; empty for too few trials.
 
-    By PED-ANOVA (Watanabe et al. 2023, arXiv:2304.10255). The first rung is what all trials that did not diverge have
-    in common; stopped trials have no later return.
+    By PED-ANOVA (Watanabe et al. 2023, arXiv:2304.10255); every trial that did not diverge has the first rung's return.
     """
     known = [result for result in results if result.state != "diverged"]
     if len(known) < FEWEST or len({result.means[0] for result in known}) < 2:

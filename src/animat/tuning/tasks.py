@@ -228,8 +228,7 @@ def _at(timeline: SimulatorTimeline | None, minute: float) -> Any:
 def group_by_shape(trials: Sequence[Trial], policies: int) -> list[tuple[Trial, ...]]:
     """Groups of trials that one compiled program can train: they differ only in `NUMBERS`, five policies at most.
 
-    The grouping depends only on the trials, not on the machine, as it could change the last bits. Two or more trials
-    give at least two groups, which keep two cores busy.
+    It depends only on the trials, as it can change the last bits. Two or more make at least two groups, for two cores.
     """
     by_shape: dict[tuple[Any, ...], list[Trial]] = {}
     for trial in trials:
