@@ -48,7 +48,7 @@ from animat.robots import Cartpole, Navigation
 from animat.stimulation.protocol import Protocol, read_protocol
 from animat.stimulation.selection import SelectionRule
 from animat.studies.captions import CULTURE, ROBOT
-from animat.studies.folder import claim_folder, controls_file, describe_study, episodes_file, hash_files, paths_file
+from animat.studies.folder import claim_folder, controls_file, describe_study, episodes_file, hash_files
 from animat.studies.paper import PRINTED, paper_study
 from animat.studies.pictures import CulturePictures
 from animat.studies.recording import Fit, Record
@@ -1013,6 +1013,7 @@ def test_no_two_arms_or_controls_share_a_file(tmp_path: Path) -> None:
     names = ("a", "a paths", "a over-time", "controls", "controls-1-threshold", "over-time")
     spec = RobotSpec("navigation")
     arms = [Arm(name, percentiles=held) for name in names for held in ("moving", "first")]
+    paths_file = partial(episodes_file, what="paths")
     places = {of(tmp_path, spec, arm) for arm in arms for of in (episodes_file, controls_file, paths_file)}
     # An arm's name is its own, whether its percentiles are fixed or not; controls differ by that.
     assert len(places) == 2 * len(names) + 2

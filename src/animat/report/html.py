@@ -189,5 +189,4 @@ def with_error(value: float, error: float | None) -> str:
     decimals = min(3, max(0, 1 - math.floor(math.log10(error)))) if error > 0 else 1
     rounded = f"{error:,.{decimals}f}"
     shown = rounded if error == 0 or round(error, decimals) else f"<\u00a0{10.0**-decimals:.{decimals}f}"
-    # Adding 0 turns -0 into 0.
-    return f"{round(value, decimals) + 0.0:,.{decimals}f}\u00a0±\u00a0{shown}".replace("-", MINUS)
+    return f"{value:z,.{decimals}f}\u00a0±\u00a0{shown}".replace("-", MINUS)

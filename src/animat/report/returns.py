@@ -143,8 +143,7 @@ def _name(arm: str, score: float | None) -> str:
     """The arm on two lines or more, and its score on the last."""
     first, _, rest = arm.partition(" ")
     lines = [wrapped(part, _NARROW_IN) for part in (first, rest)]
-    # Adding 0 turns -0 into 0.
-    scored = "" if score is None else f"\nscore {round(score, 2) + 0.0:.2f}"
+    scored = "" if score is None else f"\nscore {score:z.2f}"
     return with_minus("\n".join(lines) + scored)
 
 

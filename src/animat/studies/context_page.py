@@ -159,8 +159,7 @@ def _range(values: Sequence[float]) -> str:
 
 
 def _hundredths(value: float) -> str:
-    # Adding 0 turns -0 into 0.
-    return f"{round(value, 2) + 0.0:.2f}".replace("-", "−")
+    return f"{value:z.2f}".replace("-", "−")
 
 
 def _shares_lost(rows: Sequence[ContextRow], lost: Sequence[LostRow]) -> dict[str, dict[str, list[float]]]:

@@ -15,7 +15,7 @@ from animat.neurons.timeline import SimulatorTimeline, load_timeline
 from animat.progress import Progress
 from animat.robots.host import HostRobot
 from animat.studies.episodes import COUPLING, RANDOM, episode_rows, record_paths, write_episodes
-from animat.studies.folder import TIMELINE, controls_file, episodes_file, paths_file, policies_folder
+from animat.studies.folder import TIMELINE, controls_file, episodes_file, policies_folder
 from animat.studies.results import write_arrays
 from animat.studies.specification import Arm, RobotSpec, Study, mapping_label
 from animat.studies.task import StudyTask, study_seed
@@ -52,7 +52,7 @@ class Evaluate(StudyTask):
         paths = record_paths(setting.environment, setting.simulator(last), networks, seed)
         return [
             write_episodes(episodes_file(folder, self.spec, self.arm), parts),
-            write_arrays(paths_file(folder, self.spec, self.arm), vars(paths)),
+            write_arrays(episodes_file(folder, self.spec, self.arm, "paths"), vars(paths)),
         ]
 
 

@@ -147,14 +147,9 @@ def policies_folder(folder: Path, spec: RobotSpec, arm: Arm) -> Path:
     return folder / "policies" / spec.name / arm.slug
 
 
-def episodes_file(folder: Path, spec: RobotSpec, arm: Arm) -> Path:
-    """The episodes of an arm's policies on a robot; each arm has its own folder, so that names cannot collide."""
-    return folder / "episodes" / spec.name / arm.slug / "episodes.npz"
-
-
-def paths_file(folder: Path, spec: RobotSpec, arm: Arm) -> Path:
-    """One complete episode of each of an arm's policies on a robot."""
-    return folder / "episodes" / spec.name / arm.slug / "paths.npz"
+def episodes_file(folder: Path, spec: RobotSpec, arm: Arm, what: str = "episodes") -> Path:
+    """The episodes of an arm's policies on a robot, or `paths`; each arm has its own folder: names cannot collide."""
+    return folder / "episodes" / spec.name / arm.slug / f"{what}.npz"
 
 
 def controls_file(folder: Path, spec: RobotSpec, arm: Arm) -> Path:

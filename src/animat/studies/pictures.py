@@ -34,7 +34,7 @@ from animat.responses.responses import Responses
 from animat.robots.base import lacking
 from animat.studies.episodes import POLICY, Paths, mean_returns, rows_where
 from animat.studies.evaluating import as_recorded
-from animat.studies.folder import RECORDINGS, RESULTS, paths_file, table_file
+from animat.studies.folder import RECORDINGS, RESULTS, episodes_file, table_file
 from animat.studies.optima import kinds_of
 from animat.studies.recording import read_series
 from animat.studies.results import read_arrays, read_typed, write_table
@@ -114,7 +114,8 @@ class RobotPictures(StudyTask):
         progress.update(0.2, 1, "controls")
         controls = _controls(row for row in results.controls if row.robot == name)
         figures["controls"] = draw_controls(controls, f"{name}: controls")
-        recorded = {each.name: Paths(**read_arrays(paths_file(folder, self.spec, each))) for each in study.arms}
+        files = {each.name: episodes_file(folder, self.spec, each, "paths") for each in study.arms}
+        recorded = {arm: Paths(**read_arrays(file)) for arm, file in files.items()}
         tables.append(write_paths(folder, name, [quantity.name for quantity in robot.observation_spec], recorded))
         paths = {arm: of.episodes() for arm, of in recorded.items()}
         lacks = lacking(robot)
