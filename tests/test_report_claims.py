@@ -469,12 +469,14 @@ def test_every_line_of_a_figure_is_in_its_legend() -> None:
 
 def test_the_optimum_steps_with_the_simulator_in_use() -> None:
     optimum = np.array([1.0, 1.0, 7.0])
-    curve = LearningCurve("a", np.array([1000.0, 2000.0, 3000.0]), np.zeros((2, 3)), None, optimum)
+    curve = LearningCurve("a", np.array([1000.0, 2000.0, 3000.0]), np.zeros((2, 3)), np.full(3, np.nan), optimum)
     figure = draw_learning_curves([curve], "cartpole")
     (line,) = [line for line in figure.axes[0].lines if line.get_label() == "optimal return"]
     assert line.get_drawstyle() == "steps-pre"
     assert np.asarray(line.get_xdata()).tolist() == [0, 1, 2, 3]
     assert np.asarray(line.get_ydata()).tolist() == [1, 1, 1, 7]
+    # What is not known, such as the optimum of a robot without a grid, has no line.
+    assert "random actions" not in legend(figure)
 
 
 def test_learning_curves_are_of_whole_rounds_of_episodes() -> None:

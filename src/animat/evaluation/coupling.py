@@ -87,8 +87,7 @@ def best_coupling(
             f"robot: expected one in JAX, as the search for the best coupling takes thousands of episodes, got "
             f"{environment.robot.name}, which is stepped in Python"
         )
-    spec = environment.robot.observation_spec
-    seen = tuple(i for i, quantity in enumerate(spec) if not quantity.of_goal)
+    seen = tuple(i for i, quantity in enumerate(environment.robot.observation_spec) if not quantity.of_goal)
     n_commands = environment.robot.n_commands
     stimuli: Any = (None, None)
     if environment.n_actions is not None:
@@ -146,8 +145,7 @@ def _near_heuristic(
     robot = environment.robot
     if not hasattr(robot, "heuristic"):
         return np.zeros((0, 0))
-    policy = heuristic_policy(environment, simulator)
-    ran = trace(environment, simulator, policy, episodes=EPISODES, seed=seed)
+    ran = trace(environment, simulator, heuristic_policy(environment, simulator), episodes=EPISODES, seed=seed)
     running = np.arange(robot.episode_limit) < ran.lengths[..., None]
     observed = ran.observations[..., :-1, : len(robot.observation_spec)][running]
     wanted = np.asarray(jax.vmap(capability(robot, "heuristic"))(observed), np.float64).reshape(len(observed), -1)

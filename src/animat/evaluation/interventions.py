@@ -156,8 +156,7 @@ def _switch_effect(usual: Traces, other: Traces, at: int) -> SwitchEffect:
     lasted = usual.lengths > at
     # Entries after the end of either episode are not choices.
     last = np.minimum(usual.lengths, other.lengths)[..., None]
-    iterations = np.arange(usual.actions.shape[2])
-    differs = (usual.actions != other.actions) & (iterations < last)
+    differs = (usual.actions != other.actions) & (np.arange(usual.actions.shape[2]) < last)
     turned = differs.any(axis=2) & lasted
     after = (differs.argmax(axis=2) + 1 - at)[turned]
     n = int(lasted.sum())

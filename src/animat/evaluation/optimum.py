@@ -317,8 +317,7 @@ class _Programme:
             values, layers = tables.values(remaining, self._layers[case]), self._layer(case, state.neurons)
             led_to = layers, pairs, outcomes.weights, self._costs[case]
             look_ahead(values, *landings, self._grid.row_offsets, *led_to, remaining, chosen)
-            action = actions[chosen]
-            before, state = state, _step(environment, episodes, key, state, action, simulator)
+            before, state = state, _step(environment, episodes, key, state, actions[chosen], simulator)
             returns += np.where(going, np.asarray(net_reward(before, state), np.float64), 0.0)
             going &= ~np.asarray(state.ended.terminated)
             if not going.any():

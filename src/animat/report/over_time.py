@@ -73,7 +73,7 @@ def draw_learning_curves(curves: Sequence[LearningCurve], title: str) -> Figure:
             ("optimal return", curve.optimum, OPTIMUM, "--"),
             ("random actions", curve.random, GREY, ":"),
         ):
-            if levels is not None:
+            if levels is not None and np.isfinite(levels).any():
                 # A level holds up to the end of its chunk; the first chunk begins at 0.
                 steps = np.append(0.0, x), np.append(levels[:1], levels)
                 axes.step(*steps, where="pre", color=colour, linestyle=line, linewidth=1.2, label=name)

@@ -146,8 +146,7 @@ def is_usual(arm: Arm) -> bool:
 
 def policies_of(study: Study, folder: Path, spec: RobotSpec, arm: Arm) -> list[Policy]:
     """The policies of an arm on a robot."""
-    out = policies_folder(folder, spec, arm)
-    return [Policy.load(out / f"p{i}.safetensors") for i in range(study.policies)]
+    return [Policy.load(policies_folder(folder, spec, arm) / f"p{i}.safetensors") for i in range(study.policies)]
 
 
 def _networks(study: Study, folder: Path, spec: RobotSpec, arm: Arm) -> Networks:

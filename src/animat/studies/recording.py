@@ -126,8 +126,7 @@ def _write_responses(path: Path, series: list[Responses]) -> Path:
 
 def _moved(study: Study, start_min: list[float]) -> Iterator[Finding]:
     """A finding for each comparison at a minute at which no recording starts."""
-    settled = study.at_recordings(start_min).comparisons
-    for old, new in zip(study.comparisons, settled, strict=True):
+    for old, new in zip(study.comparisons, study.at_recordings(start_min).comparisons, strict=True):
         if old.at_min is not None and old.at_min != new.at_min:
             text = f"{old.name} was requested at {old.at_min:g} min and is made on the recording at {new.at_min:g} min"
             yield Finding("comparison-minute", "note", text, new.at_min)
