@@ -204,7 +204,7 @@ def test_a_loss_by_binning_is_reported_only_where_there_is_one() -> None:
     assert "binning" not in words and "none found" in words
     ((_, words),) = differing_comparisons([ROW], {140.0: 0.21})
     assert "binning moves P(x ≥ P50) by up to 0.21" in words
-    assert differing_comparisons([replace(ROW, as_in_paper="yes"), replace(ROW, as_in_paper=None)]) == ()
+    assert not [*differing_comparisons([replace(ROW, as_in_paper="yes"), replace(ROW, as_in_paper=None)])]
 
 
 # --- decisions are the study's ---------------------------------------------------------------------------------------

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from animat.errors import InvalidArgument, Mismatch, counted
@@ -159,19 +159,16 @@ def _histogram(recording: Recording, inspection: Inspection) -> PostStimulusHist
     return post_stimulus_histogram(recording, -0.4 * to_ms, to_ms, 1.0 if to_ms <= 100 else 5.0)
 
 
-def _table(inspection: Inspection) -> list[str]:
+def _table(inspection: Inspection) -> Iterator[str]:
     conditions = inspection.conditions
     chosen = " (chosen by default)" if inspection.by_default else ""
     shown = conditions[:_MOST_CONDITIONS]
     width = max([len("condition"), *(len(c.label) for c in shown)])
-    lines = [
-        f"  conditions: {inspection.responses.by}{chosen}",
-        f"  {'condition':<{width}}  responses  non-burst  median x (Hz)  P(x >= P50)",
-    ]
+    yield f"  conditions: {inspection.responses.by}{chosen}"
+    yield f"  {'condition':<{width}}  responses  non-burst  median x (Hz)  P(x >= P50)"
     for c in shown:
         median, share = (f"{c.median_rate_hz:.2f}", f"{c.share_above_median:.2f}") if c.n_non_burst else ("-", "-")
         counts = f"{c.n_responses:>9,}  {c.n_non_burst:>9,}"
-        lines.append(f"  {c.label:<{width}}  {counts}  {median:>13}  {share:>11}")
+        yield f"  {c.label:<{width}}  {counts}  {median:>13}  {share:>11}"
     if len(conditions) > len(shown):
-        lines.append(f"  ... and {len(conditions) - len(shown)} more")
-    return lines
+        yield f"  ... and {len(conditions) - len(shown)} more"

@@ -95,10 +95,8 @@ def over_rounds(
     first the short ones, which succeeded or failed early, and later the long ones, as environments that begin together
     stay in step. Before the end of the first round it is NaN; a training shorter than a round is one round.
 
-    Args:
-        iterations: done at the end of each chunk, by all environments together.
-        episodes, returns: the number of episodes that ended in each chunk, and their mean return.
-        longest: iterations of a round: those of the longest possible episode, times the number of environments.
+    `iterations` are done at the end of each chunk, by all environments together; `episodes` end in each chunk, with the
+    mean `returns`; `longest` are the iterations of a round: of the longest episode, times the number of environments.
     """
     longest_known = min(float(longest), float(iterations[-1]))
     # The number of chunks that ended at least a round before the end of each.

@@ -17,12 +17,8 @@ class TensorBoard:
         with TensorBoard("runs") as board:
             train(training, timeline, "policies", callbacks=[board])
 
-    Args:
-        folder: for the runs, `p0`, `p1` and so on; created if it is missing.
-
-    Raises:
-        AnimatError: if tensorboardX is not installed.
-        InvalidFile: on entry or call, if the folder cannot be written to.
+    The folder, for the runs `p0`, `p1` and so on, is created if missing. Raises AnimatError if tensorboardX is not
+    installed, and InvalidFile, on entry or call, if the folder cannot be written to.
     """
 
     def __init__(self, folder: str | Path) -> None:

@@ -107,7 +107,7 @@ def run_over_cultures(
             raise AnimatError("; ".join(f"{name}: {error}" for name, error in failed.items()))
         results = {name: read_typed(each.folder / RESULTS, Results) for name, each in finished.items()}
         comparisons = {name: each.comparisons for name, each in results.items()}
-        summary = over_cultures(list(comparisons.values()))
+        summary = tuple(over_cultures(list(comparisons.values())))
         scores = {name: each.scores for name, each in results.items()}
         write_named_records(folder / COMPARISONS, comparisons, ComparedReturns, "culture")
         write_records(folder / SUMMARY, OverCultures, summary)
@@ -184,28 +184,24 @@ class _Share:
         self._report()
 
 
-def over_cultures(comparisons: Sequence[Sequence[ComparedReturns]]) -> tuple[OverCultures, ...]:
+def over_cultures(comparisons: Sequence[Sequence[ComparedReturns]]) -> Iterator[OverCultures]:
     """Each comparison over cultures, all of which have the same comparisons in the same order."""
-    found = []
     for rows in zip(*comparisons, strict=True):
         first, second = np.array([row.mean_first for row in rows]), np.array([row.mean_second for row in rows])
         difference = interval_of_mean(second - first)
-        found.append(
-            OverCultures(
-                comparison=rows[0].comparison,
-                robot=rows[0].robot,
-                cultures=len(rows),
-                mean_first=float(first.mean()),
-                mean_second=float(second.mean()),
-                difference=difference.value,
-                low_95=difference.low if len(rows) > 1 else None,
-                high_95=difference.high if len(rows) > 1 else None,
-                larger_in=int((second > first).sum()),
-                holds_in=sum(row.outcome == SECOND for row in rows),
-                tested=sum(row.outcome != TOO_FEW for row in rows),
-            )
+        yield OverCultures(
+            comparison=rows[0].comparison,
+            robot=rows[0].robot,
+            cultures=len(rows),
+            mean_first=float(first.mean()),
+            mean_second=float(second.mean()),
+            difference=difference.value,
+            low_95=difference.low if len(rows) > 1 else None,
+            high_95=difference.high if len(rows) > 1 else None,
+            larger_in=int((second > first).sum()),
+            holds_in=sum(row.outcome == SECOND for row in rows),
+            tested=sum(row.outcome != TOO_FEW for row in rows),
         )
-    return tuple(found)
 
 
 def write_cultures_page(study: Study, found: CulturesRun) -> Path:

@@ -23,16 +23,8 @@ PAPER_POLICIES = 10
 """Per arm. Source: Sawada et al. 2022."""
 
 
-def decisions(study: Study, series: Sequence[Responses] = ()) -> tuple[tuple[str, str], ...]:
+def decisions(study: Study, series: Sequence[Responses] = ()) -> Iterator[tuple[str, str]]:
     """Where the paper is silent or contradicts itself, and what this study does instead; `series` gives the numbers."""
-    neurons = (*_culture_decisions(study),) if study.needs_neurons else ()
-    simulators = (*_simulator_decisions(study, series),) if study.needs_neurons else ()
-    robots = (each for spec in study.robots for each in spec.robot().departures())
-    return (*_size_decisions(study), *neurons, *robots, *simulators, *_learning_decisions(study))
-
-
-def _size_decisions(study: Study) -> Iterator[tuple[str, str]]:
-    """Where the numbers of recordings, policies or iterations differ."""
     culture, paper = study.culture, Source()
     if study.needs_neurons and culture.kind == "virtual" and _recorded(culture) != _recorded(paper):
         yield "Recordings", f"The paper has {_recorded(paper)}. Here there are {_recorded(culture)}."
@@ -45,6 +37,31 @@ def _size_decisions(study: Study) -> Iterator[tuple[str, str]]:
                 f"Iterations on {spec.name}",
                 f"The paper trains a policy for {iterations:,}. Here it is trained for {spec.trained_for:,}.",
             )
+    if study.needs_neurons:
+        yield from _culture_decisions(study)
+    for spec in study.robots:
+        yield from spec.robot().departures()
+    if study.needs_neurons:
+        yield from _simulator_decisions(study, series)
+    yield (
+        "Learning",
+        "The paper's hosted platform is retired; it chose networks and settings by itself and took up to 60 minutes. "
+        "Here discrete soft actor-critic is used with one set of settings for all, and training is taken to last "
+        f"{study.training_min:g} minutes on the culture's clock. The critics, which are used only in training, see how "
+        "much of the episode is left, so that a time limit ends the return they learn; policies do not.",
+    )
+    if study.actions == "most probable":
+        actions, here = "Most probable actions", "take the most probable one"
+        untrained = "Taking the most probable one turns each into a fixed rule, which can do worse than random actions."
+    else:
+        actions, here, untrained = "Drawn actions", "do", "They act almost at random."
+    yield actions, f"The paper does not say whether policies draw their actions in evaluation. Here they {here}."
+    if any(not arm.trained for arm in study.arms):
+        yield (
+            "Before training",
+            "The policies before training are networks with random initial weights: all actions are nearly equally "
+            f"probable. {untrained}",
+        )
 
 
 def _recorded(culture: Source) -> str:
@@ -138,36 +155,13 @@ def _burst_rule(threshold: float | None, series: Sequence[Responses]) -> str:
     )
 
 
-def _learning_decisions(study: Study) -> Iterator[tuple[str, str]]:
-    yield (
-        "Learning",
-        "The paper's hosted platform is retired; it chose networks and settings by itself and took up to 60 minutes. "
-        "Here discrete soft actor-critic is used with one set of settings for all, and training is taken to last "
-        f"{study.training_min:g} minutes on the culture's clock. The critics, which are used only in training, see how "
-        "much of the episode is left, so that a time limit ends the return they learn; policies do not.",
-    )
-    if study.actions == "most probable":
-        actions, here = "Most probable actions", "take the most probable one"
-        untrained = "Taking the most probable one turns each into a fixed rule, which can do worse than random actions."
-    else:
-        actions, here, untrained = "Drawn actions", "do", "They act almost at random."
-    yield actions, f"The paper does not say whether policies draw their actions in evaluation. Here they {here}."
-    if any(not arm.trained for arm in study.arms):
-        yield (
-            "Before training",
-            "The policies before training are networks with random initial weights: all actions are nearly equally "
-            f"probable. {untrained}",
-        )
-
-
 def differing_comparisons(
     rows: Sequence[ComparedReturns], lost: Mapping[float, float] | None = None
-) -> tuple[tuple[str, str], ...]:
+) -> Iterator[tuple[str, str]]:
     """For each comparison that differs from the paper or is undecided: its outcome, and what the optima say about it.
 
     `lost` is by how much binning moved P(x >= P50) of any condition, at most, by the recording's minute.
     """
-    described = []
     for row in rows:
         if row.as_in_paper not in ("no", "cannot tell"):
             continue
@@ -182,8 +176,7 @@ def differing_comparisons(
                 f" In this recording binning moves P(x ≥ P50) by up to {loss:.2f}: policies and optimum are those of "
                 "the simulator, and not all that the culture would allow."
             )
-        described.append((f"{row.comparison}, {row.robot}", text))
-    return tuple(described)
+        yield f"{row.comparison}, {row.robot}", text
 
 
 def explain(row: ComparedReturns) -> str:

@@ -6,7 +6,7 @@ Numbers that only figures show are written from the arrays that are drawn, to a 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
@@ -99,21 +99,20 @@ class RobotPictures(StudyTask):
         coarse = References(study, folder, self.spec, table, over_time=True) if study.needs_neurons else known
         figures: dict[str, Figure] = {}
         tables: list[Path] = []
-        curves = _curves(known, coarse, timeline)
-        if curves:
+        if curves := list(_curves(known, coarse, timeline)):
             figures["learning"] = draw_learning_curves(curves, f"{name}: learning")
             tables.append(write_learning(folder, name, curves))
         if study.comparisons:
             pairs = [_pair(row, known) for row in results.comparisons if row.robot == name]
             figures["comparisons"] = draw_comparisons(pairs, f"{name}: comparisons")
         if timeline is not None and len(timeline) > 1:
-            courses = _courses(known, coarse, timeline)
+            courses = list(_courses(known, coarse, timeline))
             until_min = float(timeline.start_min[0]) + study.training_min
             figures["over-time"] = draw_over_time(courses, f"{name}: at every recording", trained_until_min=until_min)
             tables.append(write_courses(folder, name, courses))
         progress.update(0.2, 1, "controls")
         controls = _controls(row for row in results.controls if row.robot == name)
-        figures["controls"] = draw_controls(controls, f"{name}: controls")
+        figures["controls"] = draw_controls(list(controls), f"{name}: controls")
         files = {each.name: episodes_file(folder, self.spec, each, "paths") for each in study.arms}
         recorded = {arm: Paths(**read_arrays(file)) for arm, file in files.items()}
         tables.append(write_paths(folder, name, [quantity.name for quantity in robot.observation_spec], recorded))
@@ -136,8 +135,8 @@ def _save(folder: Path, of: str, figures: Mapping[str, Figure], progress: Progre
     return files
 
 
-def _curves(known: References, coarse: References, timeline: SimulatorTimeline | None) -> list[LearningCurve]:
-    curves, study = [], known.study
+def _curves(known: References, coarse: References, timeline: SimulatorTimeline | None) -> Iterator[LearningCurve]:
+    study = known.study
     for arm in (arm for arm in study.arms if arm.trained):
         learning = learning_of(study, known.folder, known.spec, arm)
         random, optimum = [], []
@@ -148,8 +147,7 @@ def _curves(known: References, coarse: References, timeline: SimulatorTimeline |
         levels = np.array(random, np.float64), np.array(optimum, np.float64)
         iterations = learning[0, :, 0]
         returns = over_rounds(iterations, learning[:, :, 1], learning[:, :, 2], round_of(study, known.spec))
-        curves.append(LearningCurve(arm.name, iterations, returns, *levels, known.spec.robot().return_range))
-    return curves
+        yield LearningCurve(arm.name, iterations, returns, *levels, known.spec.robot().return_range)
 
 
 def round_of(study: Study, spec: RobotSpec) -> int:
@@ -174,10 +172,9 @@ def _pair(row: ComparedReturns, known: References) -> Pair:
     return Pair(row, a, b, known.random(first, row.at_min))
 
 
-def _courses(known: References, coarse: References, timeline: SimulatorTimeline) -> list[Courses]:
+def _courses(known: References, coarse: References, timeline: SimulatorTimeline) -> Iterator[Courses]:
     every_min: list[float] = timeline.start_min.tolist()
     over_time = rows_where(known.table, agent=POLICY, over_time=True)
-    panels = []
     for kind in (kind for kind in kinds_of(known.study) if kind.through_neurons):
         returns = {}
         for arm in known.study.arms_of(kind):
@@ -187,17 +184,14 @@ def _courses(known: References, coarse: References, timeline: SimulatorTimeline)
         optimum = np.array([coarse.best_return(kind, at_min) for at_min in every_min], np.float64)
         fine = {at_min: best for at_min in every_min if (best := known.best_return(kind, at_min)) is not None}
         values = optimum if np.isfinite(optimum).any() else None
-        panels.append(Courses(mapping_label(*kind.kind), timeline.start_min, returns, random, values, fine))
-    return panels
+        yield Courses(mapping_label(*kind.kind), timeline.start_min, returns, random, values, fine)
 
 
-def _controls(rows: Iterable[ControlReturns]) -> list[tuple[str, list[ControlReturns]]]:
+def _controls(rows: Iterable[ControlReturns]) -> Iterator[tuple[str, list[ControlReturns]]]:
     """Controls grouped by mapping and recording, with a title each."""
-    panels = []
     for (mapping, percentiles, at_min), same in groupby(rows, lambda row: (row.mapping, row.percentiles, row.at_min)):
         at = "" if mapping == "none" else f", recording at {at_min:g} min"
-        panels.append((f"{mapping_label(mapping, percentiles)}{at}", list(same)))
-    return panels
+        yield f"{mapping_label(mapping, percentiles)}{at}", list(same)
 
 
 def write_psth(

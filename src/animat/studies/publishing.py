@@ -282,7 +282,7 @@ def _controls(study: Study, results: Results) -> Section:
 
 def _differences(study: Study, results: Results, kept: dict[float, Fidelity], series: Sequence[Responses]) -> Section:
     rows = [row for row in results.comparisons if row.paper_p is not None]
-    differing = differing_comparisons(rows, {at_min: of.largest_loss for at_min, of in kept.items()})
+    differing = tuple(differing_comparisons(rows, {at_min: of.largest_loss for at_min, of in kept.items()}))
     paragraphs = [
         "Sawada, Wake, Sasabuchi, Takamatsu, Takahashi, Ikeuchi: Design strategies for controlling neuron-connected "
         "robots using reinforcement learning (2022). First the results that differ, then the decisions taken where the "
