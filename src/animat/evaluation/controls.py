@@ -128,22 +128,19 @@ def interventions_of(
     low, high = means.min(axis=0), means.max(axis=0)
     stretched = 2 * (means - low) / np.where(high > low, high - low, np.inf) - (high > low)
     ideal = tuple(tuple(row) if means.ndim > 1 else row for row in stretched.tolist())
-
-    def control(name: str, meaning: str, **change: Any) -> Control:
-        return Control(name, meaning, policies, **change)
-
     by_means = "each condition's mean command, stretched to the full range, in place of the response"
     at_random = "no pulse; a random recorded response in place of the neurons' own"
     changed = [
-        control("ideal actuator", by_means, commands=ideal),
-        control("random spikes", at_random, delivery="silent", is_drawn=True),
+        Control("ideal actuator", by_means, policies, commands=ideal),
+        Control("random spikes", at_random, policies, "silent", is_drawn=True),
         *_without_influence(policies),
     ]
     if not isinstance(environment.robot, HostRobot):
-        changed.append(control("yoked", "the stimuli of another episode", delivery="yoked"))
-    changed.append(control("turned round", "the opposite of every command", is_turned_round=True))
+        changed.append(Control("yoked", "the stimuli of another episode", policies, "yoked"))
+    changed.append(Control("turned round", "the opposite of every command", policies, is_turned_round=True))
     if switch_at is not None and hasattr(environment.robot, "with_goal_of"):
-        changed.append(control("goal switched", f"a different goal after {switch_at} actions", switch_at=switch_at))
+        meaning = f"a different goal after {switch_at} actions"
+        changed.append(Control("goal switched", meaning, policies, switch_at=switch_at))
     return changed
 
 

@@ -64,17 +64,13 @@ def other_simulator(trained: Mapping[str, Any], given: Mapping[str, Any]) -> Ite
     if "kind" in differing:
         # Only histograms have bins and a range.
         differing = [name for name in differing if name not in ("bins", "range_hz")]
-    if differing:
-        values = ", ".join(
-            f"{_LABELS.get(name, name)} {_or_default(trained[name])}, here {_or_default(given.get(name))}"
-            for name in differing
-        )
-        message = f"the policies were trained on simulators that were fitted differently: {values}"
+    values = []
+    for name in differing:
+        before, here = ("by default" if of.get(name) is None else of[name] for of in (trained, given))
+        values.append(f"{_LABELS.get(name, name)} {before}, here {here}")
+    if values:
+        message = f"the policies were trained on simulators that were fitted differently: {', '.join(values)}"
         yield Finding("other-simulator", "warning", message)
-
-
-def _or_default(value: Any) -> Any:
-    return "by default" if value is None else value
 
 
 _LABELS = {"by": "conditions", "burst_threshold": "burst threshold", "range_hz": "range (Hz)"}
