@@ -76,8 +76,7 @@ class Source:
             if each.name not in ("kind", "files", "folders") and getattr(self, each.name) != each.default:
                 raise InvalidArgument(f"{each.name}: expected only for a culture that is recorded, got kind = 'files'")
         # An invalid protocol is refused before a folder is made.
-        if self.kind == "virtual":
-            self.protocol()
+        self.protocol()
 
     @property
     def name(self) -> str:
