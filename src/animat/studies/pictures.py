@@ -119,11 +119,9 @@ class RobotPictures(StudyTask):
         paths = {arm: of.episodes() for arm, of in recorded.items()}
         lacks = lacking(robot)
         if "draw_paths" not in lacks:
-            only_paths = {c: [path for path, _ in each] for c, each in paths.items()}
-            figures["paths"] = draw_paths(robot, only_paths, f"{name}: one episode of each policy")
+            figures["paths"] = draw_paths(robot, paths, f"{name}: one episode of each policy")
         if "draw" not in lacks:
-            middle = {c: sorted(each, key=lambda one: len(one[0]))[len(each) // 2] for c, each in paths.items()}
-            figures["frames"] = draw_frames(robot, middle, f"{name}: the episode of median length of each arm")
+            figures["frames"] = draw_frames(robot, paths, f"{name}: the episode of median length of each arm")
         return tables + _save(folder, name, figures, progress)
 
 
