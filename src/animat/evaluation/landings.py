@@ -28,7 +28,6 @@ class Landings(NamedTuple):
         row_places: distances from that row in steps.
         nodes: first of the nodes along the row; `ENDED` where the task ended, `ENDS_NEXT` where the next one ends it.
         places: distances from that node in steps; for `ENDS_NEXT` the reward of the next iteration.
-        rewards: of the iteration.
     """
 
     rows: Int32[np.ndarray, "landings rows"]

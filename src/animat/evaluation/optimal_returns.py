@@ -112,7 +112,7 @@ def with_enough_samples(responses: Responses) -> tuple[Responses, tuple[str, ...
     """Responses to the conditions with 30 or more non-burst responses, and the other conditions, with their number.
 
     The best of several values is likely a lucky one: three responses promise too much. With 30, nine of ten intervals
-    contain the true optimum, with 10 four of five (docs/evidence/optimal-return.md). UnusableData if none has as many.
+    contain the true optimum, with 10 four of five (docs/evidence/optimal-return.md). UnusableData if none has 30.
     """
     n = [len(responses.rates_of(i)) for i in range(len(responses.conditions))]
     few = too_few(responses.conditions, n)
@@ -148,7 +148,6 @@ class OptimalReturn:
 
     Attributes:
         random: mean return of random stimuli.
-        best: the optimal return of any controller.
         context: how much of it a coupling from sensors to stimuli leaves unused.
     """
 
@@ -189,7 +188,6 @@ def optimal_returns(
         resolution: of the optimum's grid (`best_returns`); the default moves the cartpole's optima by at most 1.1.
         episodes: of random stimuli, of the best coupling, and of the optimum's controller.
         resamples: of the responses, for the optimum's interval (`WellSampled.with_interval`).
-        seed: decides every random draw.
         progress: optima, their intervals, and couplings take about as long each.
 
     Raises UnusableData if no condition has 30 non-burst responses.

@@ -137,7 +137,6 @@ def best_returns(
         grid: over the robot's states; None: `grid_for(robot)`.
         resolution: factor for the steps of the grid along each axis; 0.6 is fast and coarse.
         episodes: of the controller; 0: it is not run, which is faster.
-        seed: decides every random draw.
 
     Raises:
         InvalidArgument: for no cases, an environment of unknown effect, a robot without a grid, or an invalid number.

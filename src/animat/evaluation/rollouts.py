@@ -53,7 +53,6 @@ class Networks(Actor):
 
     Attributes:
         scales: by which observations were divided in each policy's training, whatever robot it now drives.
-        greedy: whether the most probable action is taken.
     """
 
     network: Network

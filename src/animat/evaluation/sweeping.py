@@ -72,7 +72,6 @@ def bellman_backup(
         rows, row_places, nodes, places, rewards: the landings, as in `animat.evaluation.landings.Landings`.
         row_offsets: of the rows around a landing.
         outcomes, weights: of the actions in each layer, the landing and the next layer, and their weights.
-        costs: of the trial of each action.
         remaining: iterations left after this one.
         lowest, highest: bounds of all values, which interpolation near a cliff could exceed.
         best: output, as `values`.

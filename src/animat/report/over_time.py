@@ -37,10 +37,7 @@ class LearningCurve:
     within: tuple[float, float] = (-np.inf, np.inf)
 
     def mean_with_interval(self) -> Float64[np.ndarray, "3 chunks"]:
-        """The mean over policies in each chunk and its 95 % interval by Student's t.
-
-        The mean is NaN if no episode of any policy ended, the interval if episodes of fewer than two did.
-        """
+        """The mean over policies in each chunk and its 95 % interval by Student's t, NaN where too few have a return."""
         from scipy.stats import t
 
         known, (lowest, highest) = np.isfinite(self.returns), self.within
@@ -114,9 +111,7 @@ class Courses:
 
     Attributes:
         title: the mapping.
-        minutes: of the recordings.
         returns: mean return of each policy at each recording, by the arm's name.
-        random: return of random actions at each recording.
         optimum: optimal return on a coarse grid at each recording; None if not known.
         fine_optimum: optimal return on a fine grid at some of the minutes.
     """

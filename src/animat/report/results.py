@@ -131,10 +131,7 @@ class HeuristicComparison:
 
 @dataclass(frozen=True)
 class ReflexComparison:
-    """Trained policies and the best coupling, as in `animat.evaluation.coupling`; None for unknown values.
-
-    Gap and score are the context gap of the task and the context score of the policies, with their 95 % intervals.
-    """
+    """Trained policies and the best coupling, with context gap and score (`ContextGap`); None for unknown values."""
 
     robot: str
     arm: str

@@ -108,8 +108,7 @@ class Pair(NamedTuple):
 def draw_comparisons(pairs: Sequence[Pair], title: str) -> Figure:
     """One column per comparison: above with random actions (dotted) and the optimal return (dashed), below enlarged.
 
-    Boxes reach from the first to the third quartile with the median, whiskers to 1.5 times that range; points are
-    policies. `pairs` has at least one comparison, all on one robot.
+    `pairs` has at least one comparison, all on one robot.
     """
     figure = new_figure(max(2.7 * len(pairs), 4.5), 6.4, title)
     rows = figure.subplots(2, len(pairs), squeeze=False, height_ratios=[1.0, 0.9])

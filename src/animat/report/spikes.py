@@ -40,10 +40,7 @@ _ARTEFACT_MS = 5.0
 
 
 def draw_raster(recording: Recording, responses: Responses) -> Figure:
-    """Spikes by channel in a stretch of the recording, and around each stimulus, sorted by condition.
-
-    The latter are shown from 20 ms before a stimulus to 50 ms after it, or to twice the window's end if that is later.
-    """
+    """Spikes by channel in a stretch of the recording, and around each stimulus, sorted by condition."""
     to_ms = max(50.0, 2 * responses.window_ms[1])
     figure = new_figure(8.0, 7.0)
     upper, lower = figure.subplots(2, 1, height_ratios=[1, 1.25])

@@ -219,10 +219,7 @@ class Tune:
 
 @dataclass(frozen=True)
 class Tuning:
-    """Everything that determines a tuning's results, except for recordings in files.
-
-    The study has one robot and one arm, and the settings with which the search begins.
-    """
+    """All that determines a tuning's results but recordings in files; the study has one robot and one arm."""
 
     study: Study
     tune: Tune

@@ -17,7 +17,6 @@ class Moment:
     """The state from one time on.
 
     Attributes:
-        time_s: when the state begins.
         iteration: of the robot; -1 before it moves.
         turn: number that decides how the episode starts.
         observation: in the robot's units; empty if it was not recorded.
@@ -44,10 +43,8 @@ class Scene:
     """A stretch of time with everything that is drawn.
 
     Attributes:
-        conditions: their labels, in their order.
         moments: in order of time; those of the first episode from its start, so that a host robot can be replayed.
         spike_times_s, spike_channels: recorded spikes, in order of time.
-        pulse_times_s: of all stimuli.
         n_channels: of the array; 0 without an array, when only responses are shown.
         lost_bytes: bytes at the end of a session's log that are torn or damaged and not shown.
         runner_seed: of the runner that moved a host robot (`animat.closed_loop.runner.HostRunner`).

@@ -41,7 +41,6 @@ def scene_of_policies(
         timeline: the culture's simulators; None for policies without neurons.
         at_min: minute whose newest recording is used; None: the last recording.
         span_s: start and end of the film; None: the first minute.
-        seed: decides every random draw.
 
     InvalidArgument for a span after the last episode, other conditions than the policies', or a seed above 32 bits.
     """
