@@ -294,7 +294,7 @@ class _Programme:
         starts = jax.vmap(self._robot.reset)(jax.random.split(jax.random.key(seed), _STARTS))
         first = np.array([INITIAL_HISTORY])
         at_first = [of_case.start + int(self._layer(case, first)[0]) for case, of_case in enumerate(self._layers)]
-        return self._interpolate(values[:, at_first], starts)
+        return self._mean_over(values[:, at_first], starts)
 
     def play(
         self, tables: _Tables, case: int, episodes: int, seed: int, *, clock: bool
@@ -328,10 +328,8 @@ class _Programme:
         memory = memory_of(*self._cases[case])
         return np.zeros(len(history), np.int32) if memory is None else np.asarray(class_of(memory, history), np.int32)
 
-    def _interpolate(
-        self, values: Float32[np.ndarray, "rows cases nodes"], states: Any
-    ) -> Float64[np.ndarray, " cases"]:
-        """The mean value over some states, of each case."""
+    def _mean_over(self, values: Float32[np.ndarray, "rows cases nodes"], states: Any) -> Float64[np.ndarray, " cases"]:
+        """The mean value of each case over some states, interpolated."""
         row, row_places, _, node, place = (np.asarray(x) for x in jax.vmap(self._grid.locate)(states))
         alike, counts = np.unique(np.column_stack([row, node, place, row_places]), axis=0, return_counts=True)
         weights = np.empty(len(self._grid.row_offsets), np.float32)

@@ -37,7 +37,7 @@ class LearningCurve:
     within: tuple[float, float] = (-np.inf, np.inf)
 
     def mean_with_interval(self) -> Float64[np.ndarray, "3 chunks"]:
-        """The mean over policies in each chunk and its 95 % interval by Student's t, NaN where too few have a return."""
+        """The mean over policies in each chunk and its 95 % interval by Student's t, NaN where too few have one."""
         from scipy.stats import t
 
         known, (lowest, highest) = np.isfinite(self.returns), self.within

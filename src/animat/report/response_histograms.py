@@ -159,9 +159,7 @@ def _scatter(axes: Axes, responses: Responses, which: np.ndarray | slice, colour
     axes.scatter(x, y, s=9, alpha=alpha, color=colour, linewidths=0, label=label, rasterized=True)
 
 
-def rate_edges(
-    responses: Responses, rates_hz: Float64[np.ndarray, " some"], n_bins: int
-) -> Float64[np.ndarray, " edges"]:
+def rate_edges(responses: Responses, rates_hz: Float64[np.ndarray, " n"], n_bins: int) -> Float64[np.ndarray, " edges"]:
     """Edges of at most n_bins bins that each contain equally many of the possible rates.
 
     x is an integer number of spikes over (window x channels). Bins of any other width would contain varying numbers of
@@ -171,7 +169,7 @@ def rate_edges(
     return even_edges(rates_hz, 1 / ((end_ms - start_ms) * 1e-3 * responses.n_channels), n_bins)
 
 
-def even_edges(values: Float64[np.ndarray, " some"], step: float, n_bins: int) -> Float64[np.ndarray, " edges"]:
+def even_edges(values: Float64[np.ndarray, " n"], step: float, n_bins: int) -> Float64[np.ndarray, " edges"]:
     """Edges of at most n_bins bins that each contain equally many multiples of `step`, as all values are."""
     most = round(float(values.max()) / step) if len(values) else 1
     per_bin = max(1, math.ceil((most + 1) / n_bins))

@@ -270,7 +270,6 @@ def run_context_study(
 
 
 def plan_context_study(study: ContextStudy) -> list[Job]:
-    """All jobs of the study."""
     jobs = []
     commands = {robot: robot_named(robot).n_commands for robot in study.robots}
     for culture in study.cultures:

@@ -108,11 +108,9 @@ class Setting(NamedTuple):
     action_labels: tuple[str, ...]
 
     def simulator(self, at_min: float) -> NeuronSimulator | None:
-        """The simulator at a minute."""
         return None if self.timeline is None else self.timeline.at(at_min)
 
     def run(self, actor: Actor, at_min: float, episodes: int, seed: int) -> Episodes:
-        """Run episodes at a minute."""
         return roll_out(self.environment, self.simulator(at_min), actor, episodes=episodes, seed=seed)
 
 
@@ -145,7 +143,6 @@ def is_usual(arm: Arm) -> bool:
 
 
 def policies_of(study: Study, folder: Path, spec: RobotSpec, arm: Arm) -> list[Policy]:
-    """The policies of an arm on a robot."""
     return [Policy.load(policies_folder(folder, spec, arm) / f"p{i}.safetensors") for i in range(study.policies)]
 
 

@@ -143,7 +143,6 @@ def _is_claimed(folder: Path, what: str, manifest: dict[str, Any], files: list[s
 
 
 def policies_folder(folder: Path, spec: RobotSpec, arm: Arm) -> Path:
-    """The policies of an arm on a robot."""
     return folder / "policies" / spec.name / arm.slug
 
 
@@ -158,7 +157,6 @@ def controls_file(folder: Path, spec: RobotSpec, arm: Arm) -> Path:
 
 
 def optima_file(folder: Path, robot: str, what: str = "optima") -> Path:
-    """The optimal returns on a robot."""
     return folder / "optima" / f"{robot}-{what}.json"
 
 

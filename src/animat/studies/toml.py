@@ -63,7 +63,6 @@ def study_from(data: dict[str, Any], path: str | os.PathLike[str]) -> Study:
 
 
 def _with_current_keys(data: dict[str, Any]) -> dict[str, Any]:
-    """The data with former keys renamed."""
     data = _rename_keys(data, FORMER[""])
     data |= {name: _rename_keys(data[name], names) for name, names in FORMER.items() if name in data}
     culture = data.get("culture")

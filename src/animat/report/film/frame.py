@@ -50,7 +50,6 @@ class Frames:
         return (*self._colours.values(), *COMMANDS, _PAPER, _INK, _FAINT, _LINE, "#ffffff")
 
     def at(self, time_s: float) -> Image.Image:
-        """The frame at a time."""
         scene = self._scene
         n_begun = int(np.searchsorted(self._times_s, time_s, "right"))
         # Before the first moment its robot is shown, but nothing of it has happened yet.
