@@ -144,8 +144,7 @@ def write_page(
 ) -> Path:
     """Write the page atomically; each section has an entry in the table of contents.
 
-    The lead follows the title; the colophon is lines at the end, with versions and seeds. Raises InvalidFile if the
-    page cannot be written, or a figure cannot be read.
+    The lead follows the title, the colophon ends the page. InvalidFile if that cannot be written, or a figure not read.
     """
     from jinja2 import Environment, PackageLoader, StrictUndefined
 

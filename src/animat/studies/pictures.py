@@ -21,7 +21,7 @@ from animat.recordings.reading import read_recordings
 from animat.recordings.recording import Recording
 from animat.records import read_record
 from animat.report.array import draw_array, rates_of_sites
-from animat.report.drift import PERCENTILES, Drift, draw_drift, drift_of
+from animat.report.drift import PERCENTILES, draw_drift, drift_of
 from animat.report.episodes import draw_frames, draw_paths
 from animat.report.over_time import Courses, LearningCurve, draw_learning_curves, draw_over_time, over_rounds
 from animat.report.response_histograms import draw_burst_separation, draw_response_histograms, draw_responses_over_time
@@ -78,7 +78,7 @@ class CulturePictures(StudyTask):
         if len(series) > 1:
             figures["over-time"] = draw_responses_over_time(series)
             figures["drift"] = draw_drift(series)
-            tables.append(write_drift(folder, drift_of(series)))
+            tables.append(write_drift(folder, series))
         return tables + _save(folder, "culture", figures, progress)
 
 
@@ -230,11 +230,10 @@ def write_conditions(folder: Path, series: Sequence[Responses]) -> Path:
     return _write(folder, "culture-conditions", head, rows)
 
 
-def write_drift(folder: Path, drift: Drift) -> Path:
+def write_drift(folder: Path, series: Sequence[Responses]) -> Path:
     """Percentiles of the non-burst responses to all conditions, and the share of bursts, at every recording."""
     head = ("at_min", *(f"p{percent}_hz" for percent in PERCENTILES), "burst_share")
-    columns = (drift.minutes, *drift.percentiles_hz.T, drift.bursts)
-    return _write(folder, "culture-drift", head, zip(*(column.tolist() for column in columns), strict=True))
+    return _write(folder, "culture-drift", head, drift_of(series).tolist())
 
 
 def write_array(folder: Path, recording: Recording) -> Path:

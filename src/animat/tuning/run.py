@@ -49,8 +49,7 @@ def tune(
     If killed at any moment and called again, it continues; the journal and the results are the same, byte for byte,
     with any number of workers. For this, trials are proposed `together` at a time, and reported in order.
 
-    Arguments and errors are those of `animat.studies.run.run_study`; also UnusableData if no trial had finite returns,
-    and AnimatError if Optuna is not installed.
+    Arguments and errors as in `run_study`; also UnusableData without a finite return, AnimatError without Optuna.
     """
     expect_optuna()
     expect_workers(workers, executor)

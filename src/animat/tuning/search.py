@@ -32,8 +32,7 @@ class TrialResult:
     """The result of a trial.
 
     Attributes:
-        state: `"complete"`, `"stopped"` before the end of training, as others did better, or `"diverged"`: its
-            parameters were no longer finite.
+        state: `"complete"`, `"stopped"` early, as others did better, or `"diverged"`: its parameters were not finite.
         chunks: chunks of training done at the end of each rung that it reached with finite parameters.
         returns: the mean return of each policy at these ends.
     """
