@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float64
 
+from animat import wrappers
 from animat.environment import Animat, Environment, Neurons
 from animat.evaluation.commands import mean_commands
 from animat.evaluation.coupling import best_coupling
@@ -17,15 +18,6 @@ from animat.evaluation.rollouts import Actor, Constant, Episodes, Networks, Unif
 from animat.evaluation.statistics import standard_error
 from animat.neurons.simulator import NeuronSimulator, indifferent, silenced
 from animat.robots.host import HostRobot
-from animat.wrappers import (
-    GoalSwitch,
-    IdealActuator,
-    ReversedMapping,
-    ShuffledDelivery,
-    YokedDelivery,
-    replace_innermost,
-    unwrapped,
-)
 
 Delivered = Literal["chosen", "shuffled", "silent", "yoked"]
 """What neurons are given; in training (`animat.wrappers.Delivery`) only the first two exist."""
@@ -58,21 +50,23 @@ class Control:
     def within(self, environment: Environment[Any], simulator: Neurons) -> tuple[Environment[Any], Neurons]:
         """The policies' environment and simulator, changed for this control; the same objects if nothing changes."""
         if self.is_turned_round or self.commands is not None:
-            animat = unwrapped(environment)
+            animat = wrappers.unwrapped(environment)
             assert isinstance(animat, Animat)
             # A subclass of the user's may have more attributes.
             of = animat.robot, animat.mapping, animat.n_conditions
-            changed = ReversedMapping(*of) if self.commands is None else IdealActuator(*of, self.commands)
-            environment = replace_innermost(environment, lambda _: changed)
+            changed: Animat[Any] = wrappers.ReversedMapping(*of)
+            if self.commands is not None:
+                changed = wrappers.IdealActuator(*of, self.commands)
+            environment = wrappers.replace_innermost(environment, lambda _: changed)
         if self.delivery == "shuffled":
-            environment = ShuffledDelivery(environment)
+            environment = wrappers.ShuffledDelivery(environment)
         elif self.delivery == "yoked":
-            environment = YokedDelivery(environment)
+            environment = wrappers.YokedDelivery(environment)
         elif self.delivery == "silent" and simulator is not None:
             # What is delivered makes no difference to neurons whose responses are drawn.
             simulator = indifferent(simulator) if self.is_drawn else silenced(simulator)
         if self.switch_at is not None:
-            environment = GoalSwitch(environment, self.switch_at)
+            environment = wrappers.GoalSwitch(environment, self.switch_at)
         return environment, simulator
 
     def run(self, environment: Environment[Any], simulator: Neurons, *, episodes: int, seed: int) -> Episodes:
@@ -101,7 +95,7 @@ def controls_of(
         action = "the command" if environment.n_actions is None else "the stimulus nearest to the command"
         meaning = f"no learning: {action} of the robot's heuristic"
         controls.append(Control("heuristic", meaning, heuristic_policy(environment, simulator)))
-    if policies is not None and isinstance(unwrapped(environment), Animat):
+    if policies is not None and isinstance(wrappers.unwrapped(environment), Animat):
         controls += _without_influence(policies)
     return controls
 
