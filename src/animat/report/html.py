@@ -148,13 +148,8 @@ def write_page(
     """
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
-    environment = Environment(
-        loader=PackageLoader("animat.report", "."),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
+    loader, strict = PackageLoader("animat.report", "."), StrictUndefined
+    environment = Environment(loader=loader, autoescape=True, undefined=strict, trim_blocks=True, lstrip_blocks=True)
     # Names of files can contain `#` or `:`, which mean something else in a link.
     environment.filters |= {"cell": cell, "prose": with_links, "data_url": _data_url, "url": quote}
     page = environment.get_template("report.html.j2")

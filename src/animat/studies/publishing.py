@@ -272,12 +272,9 @@ def _controls(study: Study, results: Results) -> Section:
     )
     comparisons = report_tables.heuristic_table(results), report_tables.reflexes_table(results)
     sentences = [*(f"{each}." for each in not_outperforming(results)), *describe_reflexes(results.reflexes)]
-    return Section(
-        "Is it the culture?",
-        ("Each control removes something.", *map(_begin, sentences)),
-        points,
-        (*(table for table in comparisons if table.rows), report_tables.controls_table(study, results)),
-    )
+    paragraphs = ("Each control removes something.", *map(_begin, sentences))
+    tables = (*(table for table in comparisons if table.rows), report_tables.controls_table(study, results))
+    return Section("Is it the culture?", paragraphs, points, tables)
 
 
 def _differences(study: Study, results: Results, kept: dict[float, Fidelity], series: Sequence[Responses]) -> Section:

@@ -48,37 +48,24 @@ def comparisons_table(rows: Sequence[ComparedReturns]) -> Table:
 
 def returns_table(rows: Sequence[ComparedReturns]) -> Table:
     """The comparisons as mean returns, optima and scores."""
-    return table_of(
-        "The same comparisons as returns",
-        rows,
-        [
-            *columns_of("first", "second", "robot", "mean_first", "mean_second"),
-            ("random second", "random_second"),
-            ("optimum first", _pair("optimum_first", "optimum_error_first")),
-            ("optimum second", _pair("optimum_second", "optimum_error_second")),
-            *columns_of("score_first", "score_second"),
-        ],
-        note=_SCORE_NOTE + " ±: its possible error, due to the grid, or down to the return of its controller.",
-        beside="tables/comparisons.csv",
-    )
+    columns = columns_of("first", "second", "robot", "mean_first", "mean_second", "random_second")
+    columns += [(f"optimum {side}", _pair(f"optimum_{side}", f"optimum_error_{side}")) for side in ("first", "second")]
+    columns += columns_of("score_first", "score_second")
+    note = _SCORE_NOTE + " ±: its possible error, due to the grid, or down to the return of its controller."
+    return table_of("The same comparisons as returns", rows, columns, note=note, beside="tables/comparisons.csv")
 
 
 def scores_table(results: Results) -> Table:
     """Every arm at every minute at which it was evaluated."""
-    return table_of(
-        "Every arm",
-        results.scores,
-        [
-            *columns_of("robot", "arm", "at_min", "policies", "episodes"),
-            ("mean", "mean_return"),
-            ("s.d.", "standard_deviation"),
-            ("interquartile mean", _interval("interquartile_mean", "low_95", "high_95")),
-            *columns_of("random", "optimum"),
-            ("score", "normalised_score"),
-        ],
-        note=_SCORE_NOTE,
-        beside="tables/scores.csv",
-    )
+    columns: Columns = [
+        *columns_of("robot", "arm", "at_min", "policies", "episodes"),
+        ("mean", "mean_return"),
+        ("s.d.", "standard_deviation"),
+        ("interquartile mean", _interval("interquartile_mean", "low_95", "high_95")),
+        *columns_of("random", "optimum"),
+        ("score", "normalised_score"),
+    ]
+    return table_of("Every arm", results.scores, columns, note=_SCORE_NOTE, beside="tables/scores.csv")
 
 
 def optima_table(optima: Sequence[StudyOptimum]) -> Table:
@@ -161,78 +148,59 @@ def controls_table(study: Study, results: Results) -> Table:
     any_command = any(spec.robot().baseline_commands is None for spec in study.robots)
     if any_command and any(row.mapping == "none" for row in results.controls):
         note += " Without neurons, where any command can be chosen, there is no constant control."
-    return table_of(
-        "Controls",
-        results.controls,
-        [
-            ("robot", "robot"),
-            ("mapping", lambda row: mapping_label(row.mapping, row.percentiles)),
-            ("at (min)", lambda row: None if row.mapping == "none" else row.at_min),
-            *columns_of("control", "actors"),
-            ("mean return", _pair("mean_return", "standard_error")),
-            *columns_of("random", "optimum"),
-            ("score", "normalised_score"),
-        ],
-        note=note,
-        beside="tables/controls.csv",
-        folded=len(results.controls) > _MOST_ROWS,
-    )
+    columns: Columns = [
+        ("robot", "robot"),
+        ("mapping", lambda row: mapping_label(row.mapping, row.percentiles)),
+        ("at (min)", lambda row: None if row.mapping == "none" else row.at_min),
+        *columns_of("control", "actors"),
+        ("mean return", _pair("mean_return", "standard_error")),
+        *columns_of("random", "optimum"),
+        ("score", "normalised_score"),
+    ]
+    folded = len(results.controls) > _MOST_ROWS
+    return table_of("Controls", results.controls, columns, note=note, beside="tables/controls.csv", folded=folded)
 
 
 def goals_table(results: Results) -> Table:
     """One row for each objective, arm and control."""
-    return table_of(
-        "Goals",
-        results.goals,
-        [
-            *columns_of("robot", "arm", "agent", "at_min", "episodes"),
-            ("success", "success_share"),
-            *columns_of("margin", "objective"),
-            ("satisfied (%)", "satisfaction"),
-        ],
-        note="Means over all episodes. Success: share of episodes. Margin: how far an episode was from failing its "
-        "goal, or from meeting it, in scales of the quantities: above 0 if it succeeded, and the larger the better.",
-        beside="tables/goals.csv",
+    columns: Columns = [*columns_of("robot", "arm", "agent", "at_min", "episodes"), ("success", "success_share")]
+    columns += [*columns_of("margin", "objective"), ("satisfied (%)", "satisfaction")]
+    note = (
+        "Means over all episodes. Success: share of episodes. Margin: how far an episode was from failing its goal, or "
+        "from meeting it, in scales of the quantities: above 0 if it succeeded, and the larger the better."
     )
+    return table_of("Goals", results.goals, columns, note=note, beside="tables/goals.csv")
 
 
 def heuristic_table(results: Results) -> Table:
     """Trained policies and the heuristic policy, compared over episodes."""
-    return table_of(
-        "Policies and the heuristic policy",
-        results.heuristic,
-        [
-            *columns_of("robot", "arm", "at_min"),
-            ("policies", "mean_return"),
-            *columns_of("heuristic", "p"),
-            ("pairs won", "wins"),
-            ("the policies", "outcome"),
-        ],
-        note="p: Mann-Whitney over episodes, two-sided. Pairs won: share of pairs of episodes in which the policies' "
-        "return is larger, ties counting half. Highlighted: the policies are not shown to outperform it at "
-        f"p < {OUTPERFORMED_P:g}.",
-        beside="tables/heuristic.csv",
-        marked=tuple(i for i, row in enumerate(results.heuristic) if row.outcome == NOT),
+    columns: Columns = [*columns_of("robot", "arm", "at_min"), ("policies", "mean_return")]
+    columns += [*columns_of("heuristic", "p"), ("pairs won", "wins"), ("the policies", "outcome")]
+    note = (
+        "p: Mann-Whitney over episodes, two-sided. Pairs won: share of pairs of episodes in which the policies' return "
+        "is larger, ties counting half. Highlighted: the policies are not shown to outperform it at "
+        f"p < {OUTPERFORMED_P:g}."
     )
+    title, rows, file = "Policies and the heuristic policy", results.heuristic, "tables/heuristic.csv"
+    marked = tuple(i for i, row in enumerate(rows) if row.outcome == NOT)
+    return table_of(title, rows, columns, note=note, beside=file, marked=marked)
 
 
 def reflexes_table(results: Results) -> Table:
     """Trained policies and the best coupling: context gap and context score."""
-    return table_of(
-        "Policies and the best reflex",
-        results.reflexes,
-        [
-            *columns_of("robot", "arm", "at_min"),
-            ("best coupling", _pair("coupling", "coupling_standard_error")),
-            ("optimum", "optimum"),
-            ("context gap", _interval("gap", "gap_low_95", "gap_high_95")),
-            ("context score", _interval("score", "score_low_95", "score_high_95")),
-        ],
-        note="Best coupling: a fixed rule from sensed values to a stimulus, without memory and without a goal, found "
-        "by a search. Context gap: (optimum − coupling) / (optimum − random), what such a rule leaves undone. Context "
-        "score: (policies − coupling) / (optimum − coupling), where the task needs more. With 95 % intervals.",
-        beside="tables/reflexes.csv",
+    columns: Columns = [
+        *columns_of("robot", "arm", "at_min"),
+        ("best coupling", _pair("coupling", "coupling_standard_error")),
+        ("optimum", "optimum"),
+        ("context gap", _interval("gap", "gap_low_95", "gap_high_95")),
+        ("context score", _interval("score", "score_low_95", "score_high_95")),
+    ]
+    note = (
+        "Best coupling: a fixed rule from sensed values to a stimulus, without memory and without a goal, found by a "
+        "search. Context gap: (optimum − coupling) / (optimum − random), what such a rule leaves undone. Context "
+        "score: (policies − coupling) / (optimum − coupling), where the task needs more. With 95 % intervals."
     )
+    return table_of("Policies and the best reflex", results.reflexes, columns, note=note, beside="tables/reflexes.csv")
 
 
 def _pair(value: str, error: str) -> Callable[[Any], str | None]:

@@ -218,12 +218,9 @@ def _draw(scene: Scene, number: int) -> Picture | None:
     if not now.observation:
         return None
     before = [m for m in scene.moments[max(0, number - MOST_EARLIER) : number] if m.episode == now.episode]
-    return draw_robot(
-        scene.robot,
-        np.array(now.observation),
-        command=0.0 if now.command is None else np.array(now.command)[()],
-        earlier=[np.array(m.observation) for m in before if m.observation],
-    )
+    command = 0.0 if now.command is None else np.array(now.command)[()]
+    earlier = [np.array(m.observation) for m in before if m.observation]
+    return draw_robot(scene.robot, np.array(now.observation), command=command, earlier=earlier)
 
 
 class _Replay:
