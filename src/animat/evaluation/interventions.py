@@ -99,10 +99,8 @@ class InterventionTable:
             lost = ["", ""] if row.name == AS_THEY_ARE else [f"{row.lost.value:.1f}", row.lost.ends]
             bits = "" if row.information is None else f"{row.information.bits.value:.2f}"
             cells.append([row.name, f"{row.returns.mean():.1f}", *lost, bits, row.meaning])
-        lines = [
-            "whose work is it: the same policies with each intervention",
-            *align_columns(["", "return", "lost", "95 % interval", "bits", ""], cells),
-        ]
+        head = ["", "return", "lost", "95 % interval", "bits", ""]
+        lines = ["whose work is it: the same policies with each intervention", *align_columns(head, cells)]
         information = self.rows[0].information
         one_goal = "no goal information: the robot has only one goal (no method `with_goal_of`)"
         lines.append(f"  {one_goal if information is None else information.to_text()}")

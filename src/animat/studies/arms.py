@@ -55,13 +55,9 @@ def arm_differences(first: Arm, second: Arm) -> Iterator[str]:
 
 def arms_table(study: Study) -> Table:
     """Each arm with its description."""
-    return Table(
-        "The arms",
-        ("arm", "description"),
-        tuple((arm.name, " ".join(_describe(arm))) for arm in study.arms),
-        note="Commands are the robot's, from −1 to +1. Medians and thresholds are percentiles of the recorded "
-        "responses.",
-    )
+    rows = tuple((arm.name, " ".join(_describe(arm))) for arm in study.arms)
+    note = "Commands are the robot's, from −1 to +1. Medians and thresholds are percentiles of the recorded responses."
+    return Table("The arms", ("arm", "description"), rows, note=note)
 
 
 def _describe(arm: Arm) -> Iterator[str]:

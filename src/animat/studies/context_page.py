@@ -23,17 +23,14 @@ def write_context_page(study: ContextStudy, found: ContextRun) -> Path:
     """Write the page and its figures."""
     by_robot = {robot: [row for row in found.rows if row.robot == robot] for robot in study.robots}
     save_formats(draw_context(by_robot), found.folder, "context")
-    gaps = picture_of(
-        found.folder,
-        "context",
-        "Context gaps and context scores",
+    caption = (
         "Left: how much of a task the best reflex leaves undone, (optimal return − best coupling) / (optimal return − "
         f"random); from the dashed line on, half of it or more. Right: how far the {study.policies} "
         "policies get from that reflex to the optimum. Each point is a culture, with its 95 % interval on the "
         "culture's simulator; an interval that reaches the frame extends beyond it. Triangles: lower bounds, as the "
-        "optimal return is not known.",
-        TABLE,
+        "optimal return is not known."
     )
+    gaps = picture_of(found.folder, "context", "Context gaps and context scores", caption, TABLE)
     summaries = tuple((robot, summarise_robot(rows)) for robot, rows in by_robot.items())
     sections = [
         Section("Results in short", (summarise_cultures(by_robot),), summaries, pictures=(gaps,)),
@@ -42,9 +39,8 @@ def write_context_page(study: ContextStudy, found: ContextRun) -> Path:
     ]
     cultures = f"Virtual culture{'' if len(study.cultures) == 1 else 's'} {', '.join(map(str, study.cultures))}"
     lead = f"{cultures}; {study.policies} policies of each robot on each, on the simulator and in closed loop."
-    return write_page(
-        found.folder / REPORT, "Does it need context, and whose work is it?", lead, sections, [f"Seed {study.seed}."]
-    )
+    title = "Does it need context, and whose work is it?"
+    return write_page(found.folder / REPORT, title, lead, sections, [f"Seed {study.seed}."])
 
 
 def draw_context(rows: Mapping[str, Sequence[ContextRow]]) -> Figure:
@@ -87,15 +83,12 @@ def _whose_work(study: ContextStudy, found: ContextRun) -> Section:
     if not lost:
         return Section("Whose work is it?", note)
     save_formats(draw_whose_work(lost), found.folder, "whose-work")
-    picture = picture_of(
-        found.folder,
-        "whose-work",
-        "Return lost by each intervention",
+    caption = (
         "The same policies with a change to the culture, to its stimuli, or to how its responses are used. 0: nothing "
         "is lost; 1: the policies' whole advantage over random stimuli is lost; below 0: something is gained. Each "
-        f"point is a culture: the mean of {study.policies} policies, {study.episodes} episodes each, on its simulator.",
-        WHOSE_WORK,
+        f"point is a culture: the mean of {study.policies} policies, {study.episodes} episodes each, on its simulator."
     )
+    picture = picture_of(found.folder, "whose-work", "Return lost by each intervention", caption, WHOSE_WORK)
     names = dict.fromkeys(name for each in lost.values() for name in each)
     rows = tuple((name, *(float(np.mean(of[name])) if name in of else None for of in lost.values())) for name in names)
     mean = "Mean over cultures of the return lost, as a fraction of the policies' advantage over random stimuli."

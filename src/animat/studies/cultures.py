@@ -23,7 +23,7 @@ from animat.execution.pinned import PinnedProcesses
 from animat.folders import expect_no_other
 from animat.process import own_cores
 from animat.progress import Progress, Silent
-from animat.report.html import Section, cell, columns_of, picture_of, table_of, write_page
+from animat.report.html import Columns, Section, cell, columns_of, picture_of, table_of, write_page
 from animat.report.results import ComparedReturns, OverCultures, Results, Score
 from animat.report.returns import draw_over_cultures
 from animat.report.style import save_formats
@@ -232,29 +232,24 @@ def _summary(study: Study, found: CulturesRun) -> Section:
         text = " ".join([_describe(compared, row), *(each for each in differences if each not in explained)])
         points.append((f"{row.robot}, {row.comparison}", text))
         explained |= set(differences)
-    table = table_of(
-        "Over cultures",
-        found.summary,
-        [
-            *columns_of("comparison", "robot", "mean_first", "mean_second", "difference"),
-            ("95 % interval", lambda row: "–" if row.low_95 is None else f"{cell(row.low_95)} to {cell(row.high_95)}"),
-            ("second mean larger in", lambda row: f"{row.larger_in} of {row.cultures}"),
-            ("significantly better in", "found_better"),
-        ],
-        note="Mean returns; each culture counts the same. Intervals are by Student's t over cultures. "
-        "Second mean larger in: cultures in which the second arm's mean return is larger. "
-        f"Significantly better in: those in which it is better at p < {LEVEL:g}, as in their own reports.",
-        beside=SUMMARY,
+    columns: Columns = [
+        *columns_of("comparison", "robot", "mean_first", "mean_second", "difference"),
+        ("95 % interval", lambda row: "–" if row.low_95 is None else f"{cell(row.low_95)} to {cell(row.high_95)}"),
+        ("second mean larger in", lambda row: f"{row.larger_in} of {row.cultures}"),
+        ("significantly better in", "found_better"),
+    ]
+    note = (
+        "Mean returns; each culture counts the same. Intervals are by Student's t over cultures. Second mean larger "
+        "in: cultures in which the second arm's mean return is larger. Significantly better in: those in which it is "
+        f"better at p < {LEVEL:g}, as in their own reports."
     )
-    picture = picture_of(
-        found.folder,
-        "over-cultures",
-        "Differences on each culture",
+    table = table_of("Over cultures", found.summary, columns, note=note, beside=SUMMARY)
+    caption = (
         "Each point is a culture: the mean return of the second arm's policies minus that of the first's; to the right "
         "of 0 the second arm is better. Above each row of points: their mean with its 95 % interval, of "
-        f"{counted(len(found.comparisons), 'culture')}.",
-        COMPARISONS,
+        f"{counted(len(found.comparisons), 'culture')}."
     )
+    picture = picture_of(found.folder, "over-cultures", "Differences on each culture", caption, COMPARISONS)
     return Section("Results in short", (), tuple(points), (arms_table(study), table), (picture,))
 
 

@@ -80,28 +80,24 @@ def optima_table(optima: Sequence[StudyOptimum]) -> Table:
         ("without clock", _pair("without_clock", "without_clock_standard_error")),
         ("nodes", "nodes"),
     ]
-    without = [row for row in optima if row.left_out is not None]
-    left_out = ""
-    if without:
-        columns.append(("left out (responses)", "left_out"))
-        left_out = (
-            f" {len(without)} of {len(optima)} optima leave out conditions with fewer than {FEW_SAMPLES} responses, "
-            "which would raise them too much. These are not used for scores, as policies act on all conditions."
-        )
-    return table_of(
-        "Optimal returns",
-        optima,
-        columns,
-        note="± grid: by how much the value differs from that on a grid with 3/4 of the steps. Interval: how well the "
+    note = (
+        "± grid: by how much the value differs from that on a grid with 3/4 of the steps. Interval: how well the "
         "responses determine the value, bootstrapped 39 times; for threshold mappings, where an arm is evaluated. "
         "Run: the mean return of the controller that takes the best actions, on the robot itself, ± its standard "
         "error: a return that is achievable. The optimal return lies between the two; scores use the value, the upper "
         "end. Highlighted: the two differ by more than 3 standard errors and the grid's error. Without clock: the same "
         "controller without knowledge of the time left, which policies do not have either. Optima at every recording, "
-        "on a coarse grid, are in optima/." + left_out,
-        beside="tables/optima.csv",
-        marked=tuple(i for i, row in enumerate(optima) if row.findings()),
+        "on a coarse grid, are in optima/."
     )
+    without = [row for row in optima if row.left_out is not None]
+    if without:
+        columns.append(("left out (responses)", "left_out"))
+        note += (
+            f" {len(without)} of {len(optima)} optima leave out conditions with fewer than {FEW_SAMPLES} responses, "
+            "which would raise them too much. These are not used for scores, as policies act on all conditions."
+        )
+    marked = tuple(i for i, row in enumerate(optima) if row.findings())
+    return table_of("Optimal returns", optima, columns, note=note, beside="tables/optima.csv", marked=marked)
 
 
 def controllability_table(study: Study, folder: Path, kept: Mapping[float, Fidelity]) -> Table:
