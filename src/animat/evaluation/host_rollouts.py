@@ -144,13 +144,9 @@ def _bodies(robot: HostRobot, seeds: Sequence[tuple[int, ...]]) -> Bodies:
 def _zeros(environment: Environment[Any], simulator: Neurons, shape: tuple[int, int]) -> Counts:
     """Counts of 0, for `shape` = (actors, episodes)."""
     n = 0 if simulator is None or environment.n_actions is None else environment.n_actions
-    return Counts(
-        np.zeros(shape),
-        np.zeros(shape, np.int64),
-        np.zeros(shape, bool),
-        np.zeros((shape[0], n), np.int64),
-        np.zeros((shape[0], n, *environment.robot.command_shape)),
-    )
+    presented = np.zeros((shape[0], n), np.int64)
+    commanded = np.zeros((*presented.shape, *environment.robot.command_shape))
+    return Counts(np.zeros(shape), np.zeros(shape, np.int64), np.zeros(shape, bool), presented, commanded)
 
 
 @partial(jax.jit, static_argnums=(0, 2), compiler_options=COMPILER_OPTIONS)

@@ -320,10 +320,7 @@ class _World:
         if timeline is None:
             raise InvalidArgument("timeline: expected the culture's simulators, as the policies act through neurons")
         minute = float(timeline.start_min[timeline.requested_row(timeline.start_min[-1] if at_min is None else at_min)])
-        differences = (
-            (*transfer.timeline_differences(each, timeline), *transfer.loop_differences(each, timeline, minute))
-            for each in policies
-        )
+        differences = (transfer.loop_differences(each, timeline, minute) for each in policies)
         findings = tuple(dict.fromkeys(chain.from_iterable(differences)))
         fixed_from_min = float(timeline.start_min[0]) if first.percentiles == "first" else None
         simulator = timeline.with_percentiles(first.percentiles).at(minute)

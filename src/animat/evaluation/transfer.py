@@ -148,7 +148,8 @@ def timeline_differences(policy: Policy, timeline: SimulatorTimeline) -> Iterato
 
 
 def loop_differences(policy: Policy, timeline: SimulatorTimeline, minute: float) -> Iterator[Finding]:
-    """Why returns on the simulator of a minute would differ from those of a closed loop on the culture."""
+    """`timeline_differences`, and why returns on the simulator of a minute would differ from those of a closed loop."""
+    yield from timeline_differences(policy, timeline)
     recorded = policy.presentation
     yield from other_presentation(recorded, Presentation("mixed", 1 if recorded is None else recorded.pulses))
     yield from other_calibration(recorded, timeline.presentation)

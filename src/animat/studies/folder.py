@@ -45,21 +45,15 @@ def describe_study(study: Study, sources: dict[str, str], device: str | None = N
     `device` is the kind of GPU that trains, as GPUs round differently; None for CPU cores, which are not recorded.
     """
     robots = [without_goal(spec.robot()) for spec in study.robots]
+    # Another version may round differently, or draw other figures.
     versions = {"python": platform.python_version(), **versions_of(_PACKAGES, robots, device)}
     if study.culture.kind == "virtual":
         from animat.cultures.tissue.parameters import REVISION
 
         # Another revision gives other spikes, even within one version of animat.
         versions["virtual tissue"] = f"revision {REVISION}"
-    return with_fingerprint(
-        {
-            "study": asdict(study),
-            "sources": sources,
-            # Another version may round differently, or draw other figures.
-            "versions": versions,
-            "seeds": {"culture": study.culture.seed, "study": study.seed},
-        }
-    )
+    seeds = {"culture": study.culture.seed, "study": study.seed}
+    return with_fingerprint({"study": asdict(study), "sources": sources, "versions": versions, "seeds": seeds})
 
 
 def source_files(study: Study, base: Path) -> list[Path]:
