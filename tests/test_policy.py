@@ -22,7 +22,7 @@ from safetensors import safe_open
 from safetensors.numpy import load, save
 from scipy import stats
 
-from animat.cli.responses import simulator_settings
+from animat.cli.command import simulator_settings
 from animat.closed_loop.loop import Loop
 from animat.coding.mapping import mapping_named
 from animat.errors import InvalidArgument, InvalidFile, UnusableData

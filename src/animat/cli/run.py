@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional
 
-from animat.cli.command import StimulationOptions, expect_no_fault
-from animat.cli.responses import policies_for, simulator_settings
+from animat.cli.command import StimulationOptions, expect_no_fault, policies_for, simulator_settings
 from animat.errors import InvalidArgument, Mismatch, UnsafeStimulus, expect_at_least, in_min
 from animat.plain_file import expect_no_file
 from animat.progress import Bar, Progress

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional
 
-from animat.cli.command import JobOptions, read_numbers, read_sac
-from animat.cli.responses import SimulatorOptions, print_warnings
+from animat.cli.command import JobOptions, SimulatorOptions, print_warnings, read_numbers, read_sac
 from animat.errors import InvalidArgument, UnusableData, counted, expect_at_least, in_file, in_min
 from animat.records import as_json
 from animat.writing import expect_writable
