@@ -51,8 +51,7 @@ class Cluster(Executor):
     Args:
         where: the scheduler's address, or the file to which it wrote its address (`dask scheduler --scheduler-file`).
         longest_s: longest duration of a batch of small calls; 0: no batches.
-        has_shared_folder: whether workers see the folder of a task at the same place; if not, the files that tasks read
-            and write go through this process.
+        has_shared_folder: whether workers see a task's folder at the same place; if not, files go through this process.
 
     Raises:
         AnimatError: if Dask is not installed, or no scheduler answers.

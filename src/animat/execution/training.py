@@ -67,8 +67,7 @@ def train(
         folder: folder for the policies, created if missing. None: train in this process and write nothing; if stopped,
             training starts again. This also allows robots and mappings that are not registered.
         workers: processes, each pinned to its own core; None: one per core. Not with an executor.
-        executor: executor for the groups of policies, which must see the folder; it stays open. None: processes on
-            this machine.
+        executor: for the groups of policies; it must see the folder, and stays open. None: processes on this machine.
         checkpoint_s: seconds between checkpoints, which a kill may cost; never changes the result.
         sources, random_return: for the manifest: names of the recordings, and the mean return of random actions, a line
             in the live page's learning curves.

@@ -44,8 +44,7 @@ class Objective:
             above a threshold, and further.
         region: the intersection of its parts.
         weight: relative to the other objectives; only the ratios of weights matter.
-        within: for `"drive"`: more consecutive iterations outside than this, the start included, end an episode as
-            failed; None: they do not.
+        within: for `"drive"`: more iterations outside in a row, start included, fail the episode; None: they do not.
     """
 
     kind: Kind

@@ -25,8 +25,7 @@ class Fidelity:
     """How often each condition passes the pooled median, in the data and in the simulator.
 
     Attributes:
-        in_data: P(x >= P50) of each condition's non-burst responses, shape (conditions,), or (conditions, readouts) for
-            several readouts.
+        in_data: P(x >= P50) of each condition's non-burst responses, shape (conditions,) or (conditions, readouts).
         in_simulator: the same for the simulator, in the same shape.
         n_above_range: non-burst responses, of any readout, above a histogram's range, counted in its last bin.
     """

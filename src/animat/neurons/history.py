@@ -33,8 +33,7 @@ class Memory(NamedTuple):
     Attributes:
         decay: of the previous trace; 0: only the last trial is remembered.
         weight: of the stimulus relative to the response; 0: only the response is remembered.
-        neighbour_exponent: of n responses, the n^neighbour_exponent with the nearest histories may be drawn; 1: all of
-            them, whatever the history.
+        neighbour_exponent: of n responses, the n^neighbour_exponent with the nearest histories may be drawn; 1: all.
         load_s: the load's time constant, s; 0: no load.
     """
 

@@ -44,13 +44,10 @@ class MemorySimulator(EmpiricalSimulator):
     `quantile` always is: the response if nothing is known about the history.
 
     Attributes:
-        before: the position in that order of each of a condition's responses, rising, padded with infinity, shape
-            (conditions, most responses).
+        before: each response's position in that order, rising, infinity as padding, shape (conditions, most responses).
         histories: the history state before them, trace and load (`Answer`), shape (conditions, most responses, 2).
-        after_hz: the responses in that order, shape (conditions, most responses), or (conditions, most responses,
-            readouts) with several readouts.
-        left: what each adds to the trace, (1 - decay) (r + weight m) / (1 + weight), shape (conditions, most
-            responses).
+        after_hz: the responses in that order, shape (conditions, most responses), or with a last axis of readouts.
+        left: what each adds to the trace, (1 - decay) (r + weight m) / (1 + weight), in the shape of `before`.
         followers: the number of these responses, which are those not preceded by a burst, shape (conditions,).
         nearest: k of each condition, shape (conditions,).
         toward: a and b of each condition, shape (conditions, 2).
@@ -225,9 +222,8 @@ def _slopes(
 ) -> Float64[np.ndarray, "conditions 2"]:
     """Slopes of each condition's ranks over trace and load, shrunk towards those of all conditions together.
 
-    With some hundred responses, the error of a slope is about as large as the slope. How much the true slopes differ
-    between conditions is estimated from all of them (empirical Bayes), and each is moved towards the common one
-    accordingly.
+    The error of a slope from some hundred responses is about as large as the slope. How much the true slopes differ
+    between conditions is estimated from all of them (empirical Bayes), and each is moved towards the common one.
 
     Source: Morris 1983 (doi:10.1080/01621459.1983.10477920).
     """

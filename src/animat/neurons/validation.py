@@ -117,8 +117,7 @@ class Validation:
         n_fitted, n_held: non-burst responses to each condition in the first and the second half.
         medians_hz: of these.
         above: P(x >= P50) of the held-out responses to each, P50 that of the first half.
-        autocorrelation, run_length, lasting: of the held-out responses, as in `Scores`; runs at or above their own P50,
-            as the thresholds of a loop adapt.
+        autocorrelation, run_length, lasting: of the held-out responses, as in `Scores`; runs at or above their own P50.
         scores: of the marginal distribution and of each kind.
         kind: the kind that the verdict is about.
         is_blocked: whether conditions were presented in blocks.

@@ -79,8 +79,7 @@ class ByInterval(Conditions):
     frequencies. If two frequencies match, the nearer one in ratio wins.
 
     The previous interval counts, not the next, as a response can depend only on what came before it. The first pulse of
-    a recording has no previous pulse, hence no condition. All pulses count as previous ones, including those of the
-    same trial.
+    a recording has no previous pulse, hence no condition. Pulses of the same trial count as previous ones, too.
 
     Attributes:
         values_hz: the frequencies, in the order of their index.

@@ -60,23 +60,19 @@ def extract_responses(
 
     Args:
         source: spikes, or the response of each channel to each stimulus.
-        by: the rule of the conditions, or its text form (`conditions_named`); None: by frequency if it is known, by
-            place if the protocol has places.
+        by: the conditions, or their text form (`conditions_named`); None: by frequency, or places if there are any.
         window_ms: start and end of the window after the pulse. A table that states its window replaces the default; for
             one that does not, this is the window in which its spikes were counted.
         burst_threshold: a ratio of active channels to use in place of Otsu's threshold; 1 keeps every response.
-        readouts: groups of channels whose x is read too, in the same windows, or `halves` or `quadrants`; bursts are
-            identified from all channels.
+        readouts: groups of channels whose x is read too, or `halves` or `quadrants`; bursts are those of all channels.
 
     Raises:
         InvalidArgument: for a window that is not a stretch of time after the stimulus, or conditions that cannot be
             read.
         UnusableData: without channels, or for conditions by interval with a table without times.
-        Mismatch: for channels that do not read all electrodes of the readouts, or a window that differs from the
-            table's.
+        Mismatch: for channels that do not read all electrodes of the readouts, or a window unlike the table's.
 
-    Source: the paper's methods (2-10 ms, x = S_total / (T N), Otsu's threshold on the ratio of active channels, here
-        only where it finds two groups).
+    Source: the paper's methods (2-10 ms, x = S_total / (T N), Otsu's threshold, here only where it finds two groups).
     """
     window_ms = check_window(window_ms)
     stimuli, n_channels = source.stimuli, len(source.channels)
@@ -180,8 +176,7 @@ def extract_series(
         by, burst_threshold: as in `extract_responses`.
         window_ms: start and end of the window after the pulse; None: the paper's, 2 to 10 ms.
         allow: names of findings (`"dead-window"`) to ignore.
-        readouts: groups of channels, the same electrodes in all recordings; `halves` and `quadrants` are those of the
-            first one.
+        readouts: groups of channels, the same electrodes in all; `halves` and `quadrants` are those of the first.
 
     Raises:
         UnusableData: if a finding refuses a recording, or recordings are of different cultures, unless `allow` names

@@ -34,8 +34,7 @@ class Readouts:
 
     Attributes:
         names: of the groups, in the order of the commands.
-        electrodes: of each group, rising; None: one group of all channels, whatever they read. An electrode may be in
-            several groups.
+        electrodes: of each group, rising; groups may overlap. None: one group of all channels, whatever they read.
 
     Raises:
         InvalidArgument: for invalid names or electrodes, or names without electrodes.
@@ -153,8 +152,7 @@ def readouts_on(readouts: str | Readouts, channels: Channels) -> Readouts:
     """Readouts defined by the electrodes of a recording's channels.
 
     Halves are the electrodes with the smaller and the larger x, split as evenly as possible; for quadrants each half is
-    split by y, as for places (`animat.stimulation.places`). For given groups, channels that do not read all of their
-    electrodes raise Mismatch.
+    split by y, as for places (`animat.stimulation.places`). Raises Mismatch for given groups that are not read whole.
     """
     if readouts == "all":
         return ALL

@@ -101,8 +101,7 @@ class TwoLinkArm(Robot[ArmState]):
                 f"step_s: expected at most {STIFFEST * SUBSTEPS * least / self.damping_n_m_s:.3g} for links so light "
                 f"and joints so damped, got {self.step_s:g}"
             )
-        # At the speed at which damping balances full torque, or, if that is less, that of the elbow alone at the end of
-        # an episode.
+        # At the speed at which damping balances full torque, or, if less, that of the elbow alone at an episode's end.
         torque_n_m, elbow_kg_m2 = max(self.torque_n_m, 1e-9), self._inertia[2]
         damped_s = TURN_RAD * SUBSTEPS * self.damping_n_m_s / torque_n_m
         longest_s = max(damped_s, math.sqrt(TURN_RAD * SUBSTEPS * elbow_kg_m2 / (torque_n_m * self.episode_limit)))

@@ -56,12 +56,10 @@ class Quantity:
         unit: such as `m`.
         scale: its usual size, in that unit; a learner divides by it.
         low, high: bounds in that unit that no observation of an episode exceeds, including the last.
-        of_goal: whether it describes the goal rather than the body and its surroundings; a reflex does not know it
-            (`animat.evaluation.coupling`).
+        of_goal: whether it describes the goal, not the body; a reflex does not know it (`animat.evaluation.coupling`).
 
     Raises:
-        InvalidArgument: for a name or a unit that is not a string, for a scale or a bound that is not a number, and for
-            bounds that do not rise.
+        InvalidArgument: for a name or unit that is not a string, a scale or bound that is no number, or falling bounds.
     """
 
     name: str

@@ -51,8 +51,7 @@ class Navigation(Robot[NavigationState]):
         heading += turn_rad u,    position += stride_m (cos heading, sin heading), clipped to the arena
         reward   = reward_goal if d <= R (and the episode ends), else R / d - 1
 
-    with d the distance to the goal after the move and R the goal's radius. An episode starts in the top-left corner,
-    facing right.
+    with d the distance to the goal after the move and R its radius. An episode starts at the top left, facing right.
 
     Attributes:
         turn_rad: turn per iteration at u = 1.

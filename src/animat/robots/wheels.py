@@ -57,8 +57,7 @@ class Wheels(Robot[WheelsState]):
     would touch a wall or an obstacle at the end of an iteration, it turns but stays where it is. d is the distance from
     its centre to the goal and R the goal's radius. A sensor points straight away from the centre and measures the
     distance from the edge of the body to the first thing it meets. An episode starts at `start_x_m`, `start_y_m` with
-    a random heading. Its goal is drawn from the places that the robot can reach from there with some space around it,
-    excluding where it already is.
+    a random heading. Its goal is drawn from the other places that the robot can reach with some space around it.
 
     Attributes:
         max_speed_m_per_s: of a wheel at u = 1.

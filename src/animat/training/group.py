@@ -65,8 +65,7 @@ def train_groups(
 ) -> list[list[Policy]]:
     """Train groups of policies at once, resuming from their checkpoint if there is one; returns the policies of each.
 
-    The result is the same, bit for bit, however often the training was stopped and started again. How many are trained
-    at once changes the last bits.
+    However often it was stopped, the result is the same to the bit; how many are trained at once changes the last bits.
 
     Args:
         groups: that one program can train (`animat.execution.gpu.group_by_program`).
@@ -150,13 +149,11 @@ def programs(
 class SideBySide:
     """The policies of groups of one program during training, chunk by chunk, with the simulators passed in.
 
-    If the groups belong to several trainings, none has lessons or is stepped outside JAX. Of their timelines only what
-    all simulators share is used.
+    Groups of several trainings have no lessons and no host robots; of their timelines, only what all share is used.
 
     Args:
         own_programs: `begin` and `train_chunk` for all of them, instead of `programs`.
-        is_diagnosed: whether they are diagnosed after each chunk and must be finite. If not, the learning curves have
-            NaN instead of the diagnosis.
+        is_diagnosed: whether they are diagnosed after each chunk, and must be finite; if not, curves have NaN there.
     """
 
     def __init__(

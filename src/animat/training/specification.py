@@ -80,8 +80,7 @@ class Training:
 
     Attributes:
         robot: the robot, or its name; with or without a goal (`animat.goals.robot.with_goal`).
-        mapping: from responses to commands, or its name; None trains the baseline without neurons, which moves the
-            robot directly.
+        mapping: from responses to commands, or its name; None: the baseline without neurons.
         policies: number of policies, each with its own random numbers.
         iterations: iterations of the robot per policy; rounded up to whole rounds of `algorithm.environments`.
         seed: decides every random draw.
@@ -95,8 +94,7 @@ class Training:
             A closed loop computes it from the culture's responses; a live run refuses such policies.
         commands: without neurons, the commands to choose from; None: any in [-1, 1], as many as the robot takes.
         algorithm: settings of Soft Actor-Critic.
-        lessons: lessons in turn, each with ranges from which episodes are drawn; a last one with a threshold is
-            followed by the task itself.
+        lessons: in turn, each with ranges for its episodes; after a last one with a threshold comes the task itself.
         pulse_cost: cost of an electrode pulse, in the units of the reward: policies are trained on the rewards minus
             the costs of their trials (`animat.coding.encoder`). Reported returns do not include the cost.
         assess: episodes of the assessment at the end of each chunk, by which the best policy so far is kept; None:

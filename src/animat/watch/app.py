@@ -155,8 +155,7 @@ def _guard(token: str, port: int) -> Callable[[Request, RequestResponseEndpoint]
     """Middleware that answers 403 to any request that is not from the page or its address, and passes on the rest.
 
     A foreign name that resolves to this machine (DNS rebinding) appears in `Host`, a foreign page in `Origin`. Neither
-    knows the token that begins every path. The time of the last request that was passed on is kept in
-    the application's `state.asked_s`.
+    knows the token that begins every path. When the last request was passed on is the application's `state.asked_s`.
     """
     hosts = {f"{name}:{port}" for name in ("127.0.0.1", "localhost")}
     origins = {f"http://{host}" for host in hosts}
