@@ -42,9 +42,7 @@ class Fidelity:
         return float(np.abs(self.in_data - self.in_simulator).max())
 
     def findings(self, *, of_memory: bool = False) -> tuple[Finding, ...]:
-        """Warnings if binning, or drawing from too few neighbours (of a memory), moves P(x >= P50) by more than
-        `LARGEST_LOSS`, or if responses lie above the range.
-        """
+        """Warnings if P(x >= P50) moves by more than `LARGEST_LOSS`, or responses lie above a histogram's range."""
         found = []
         loss = np.abs(self.in_data - self.in_simulator)
         worst = np.unravel_index(np.argmax(loss), loss.shape)

@@ -46,8 +46,7 @@ class NeuronSimulator(abc.ABC):
     With several readouts, one draw answers for all of them.
 
     Attributes:
-        percentiles: P0, P10, ..., P100 of the non-burst responses of all conditions together, in Hz, shape (11,), or
-            (readouts, 11) with several readouts.
+        percentiles: P0, P10, ..., P100 of all non-burst responses together, in Hz, shape (11,), or (readouts, 11).
         has_memory: whether its answers depend on the history.
     """
 
@@ -185,8 +184,7 @@ class EmpiricalSimulator(NeuronSimulator):
     trials are sorted by the response of all channels together.
 
     Attributes:
-        values_hz: each condition's responses, sorted, padded at the end, shape (conditions, most responses), or
-            (conditions, most responses, readouts) with several readouts.
+        values_hz: sorted responses, padded, shape (conditions, most responses), or with a last axis of readouts.
         counts: the number of responses, shape (conditions,).
     """
 
@@ -226,8 +224,7 @@ def fit_histogram(responses: Responses, *, bins: int = 20, range_hz: float | Non
     Args:
         responses: of one recording, every condition with at least one non-burst response.
         bins: how many (the paper: 20); a multiple of ten keeps all shares that thresholds use.
-        range_hz: equally wide bins from 0 to here instead (the paper: 120). Responses above it are counted in the last
-            bin, and `fidelity` reports their number.
+        range_hz: equally wide bins from 0 to here instead (the paper: 120); responses above it count in the last bin.
 
     Raises:
         InvalidArgument: as `check_binning` does.
@@ -281,8 +278,7 @@ def fit_empirical(responses: Responses, *, room: int | None = None) -> Empirical
 
     Args:
         responses: of one recording, every condition with at least one non-burst response.
-        room: the number of values that each condition has room for, so that simulators of several recordings stack;
-            None: as many as the largest condition needs.
+        room: values that each condition has room for, so that simulators stack; None: as many as the largest needs.
 
     Raises:
         UnusableData: if a condition has no non-burst response.

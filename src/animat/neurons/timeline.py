@@ -154,8 +154,7 @@ def fit_timeline(
 
     Args:
         series: responses of the recordings, all with the same conditions, window and presentation, in any order.
-        kind: `"histogram"` (the paper), `"empirical"` (draw a measured value) or `"memory"` (draw one measured after a
-            similar history); None: `"memory"`, but `"histogram"` if stimuli were presented in blocks, which do not show
+        kind: as in `Kind`; None: `"memory"`, but `"histogram"` if stimuli were presented in blocks, which do not show
             how a culture responds after a different condition.
         bins, range_hz: of a histogram, the same for all recordings, as in `fit_histogram`.
 

@@ -76,8 +76,7 @@ class Scores:
         crps_hz: continuous ranked probability score of each.
         transforms: the probability integral transform of each, from F(x-) to F(x).
         distance: Kolmogorov's distance of the transforms from uniform.
-        p_value: the probability of such a distance by chance; None for kinds that do not predict equally from all
-            responses to a condition, for which it does not hold.
+        p_value: of such a distance by chance; None for kinds that do not draw evenly from a condition's responses.
         autocorrelation: of the free runs, at lags 1 to `LAGS`.
         run_length: the mean length, in the free runs, of runs at or above P50 of the first half.
         lasting: the share of these that last 1 to `LAGS` trials or more.

@@ -79,8 +79,7 @@ def separate_bursts(
     Otsu's method splits any numbers in two. Its split is kept if there are two groups of five responses or more, with a
     valley of at least 0.8 between them, or of 0.5 if they are 8 standard deviations apart; else there are no bursts.
 
-    `active_ratio` is the share of the `n_channels` with at least one spike in the window. A given `threshold`, from
-    0 to 1, is used in any case; 1 keeps every response.
+    `active_ratio` is the share of the `n_channels` with a spike in the window; a given `threshold` is used in any case.
 
     Source: the paper's burst separation (Otsu's threshold over all ratios of a recording), which always cuts.
     """

@@ -204,14 +204,11 @@ def default_conditions(stimuli: Stimuli, protocol: Protocol | None = None) -> Co
 
 
 def conditions_named(text: str) -> Conditions:
-    """Read conditions from their text form.
+    """Read conditions from their text form; InvalidArgument for anything else.
 
     `all`, `frequency`, `frequency:5,10`, `interval:5,10`, `interval:5,10+-25%`, `electrode`,
     `electrode:23275,909+23923`, `pattern`, `pattern:0,3`, and products of frequency or interval with electrode or
     pattern, `frequency:5,80 x pattern:0,3`.
-
-    Raises:
-        InvalidArgument: for anything else.
     """
     expect_kind("conditions", text, str, "text such as 'frequency:5,10'")
     with within("conditions"):

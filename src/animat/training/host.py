@@ -52,8 +52,7 @@ def learn_and_act(
 ) -> tuple[Learner, Actions, Finished]:
     """Store a round, learn from the replay, and act in the next round.
 
-    The round is its actions, and what the bodies did: their steps (`animat.robots.host.StepResult`), and what is
-    observed once ended episodes have restarted.
+    `moved` is what the bodies did: their `StepResult`, and what is observed once ended episodes have restarted.
     """
     acting, learning = uniform_shapes(environment, settings)
     n_acting = math.prod(acting)

@@ -223,11 +223,7 @@ class Policy:
     def act(
         self, observation: Float[np.ndarray, " observations"], rng: np.random.Generator
     ) -> int | float | Float[np.ndarray, " commands"]:
-        """Draw an action from the policy: the index of a condition (or command), or a continuous command.
-
-        Args:
-            observation: in physical units, shape (observations,).
-        """
+        """Draw an action for an observation in physical units: index of a condition or command, or a command."""
         if self.n_actions is None:
             mean, log_std = np.split(self.outputs(observation).astype(np.float64), 2)
             return _squash(mean + np.exp(np.clip(log_std, -5.0, 2.0)) * rng.standard_normal(len(mean)))
@@ -362,8 +358,7 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray[Any, Any]], dict[str, Any]]:
 def first_of_alike(policies: Dict[str, Policy], attributes: Sequence[str], advice: str) -> Policy:
     """The first of several policies, which represents all of them.
 
-    `attributes` include their conditions. Raises Mismatch if one differs, or the stimuli of a condition do, and
-    InvalidArgument for anything but policies by name.
+    `attributes` include their conditions. Raises Mismatch if one differs, or stimuli do; InvalidArgument for none.
     """
     if not policies:
         raise InvalidArgument("policies: expected at least one, got none")
@@ -381,8 +376,7 @@ def first_of_alike(policies: Dict[str, Policy], attributes: Sequence[str], advic
 def load_policies(path: str | os.PathLike[str]) -> dict[str, Policy]:
     """Read one policy file, or all in a folder, by name, in the order of their numbers (p2 before p10).
 
-    Raises:
-        InvalidFile: if there is none, or one cannot be read.
+    Raises InvalidFile if there is none, or one cannot be read.
     """
     path = Path(path)
     if not is_folder(path):

@@ -16,8 +16,7 @@ from animat.training.settings import SAC
 class Batch(NamedTuple):
     """A batch of transitions; observations and rewards are scaled, actions and `ended` are floats.
 
-    The last number of a state is the time left, from 1 at the start of an episode to -1 at its limit; the actor sees
-    only the other numbers, `observation`.
+    A state ends with the time left, from 1 at the start of an episode to -1 at its limit, which the actor does not see.
     """
 
     state: Float[Array, "batch state"]

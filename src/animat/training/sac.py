@@ -173,8 +173,7 @@ def train_chunk(
 ) -> tuple[Learner, Finished]:
     """Act and learn for some rounds with one simulator; in a round every environment does one iteration.
 
-    Environment and settings are static. The rounds are those from the first up to but excluding the last, the same for
-    all policies that are trained side by side.
+    Environment and settings are static. The last round is excluded; policies trained side by side have the same rounds.
     """
     acting, learning = uniform_shapes(environment, settings)
     n_acting = math.prod(acting)
