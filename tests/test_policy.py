@@ -34,7 +34,7 @@ from animat.robots.navigation import Navigation
 from animat.stimulation.protocol import Presentation
 from animat.training.networks import Layer, forward
 from animat.training.policy import Policy, load_policies
-from animat.training.provenance import SimulatorProvenance, TrainingProvenance
+from animat.training.settings import SimulatorProvenance, TrainingProvenance
 from animat.training.specification import Percentiles
 from animat.wrappers import Delivery
 

@@ -67,8 +67,7 @@ def extract_responses(
         readouts: groups of channels whose x is read too, or `halves` or `quadrants`; bursts are those of all channels.
 
     Raises:
-        InvalidArgument: for a window that is not a stretch of time after the stimulus, or conditions that cannot be
-            read.
+        InvalidArgument: for a window that does not follow the stimulus, or conditions that cannot be read.
         UnusableData: without channels, or for conditions by interval with a table without times.
         Mismatch: for channels that do not read all electrodes of the readouts, or a window unlike the table's.
 
@@ -179,10 +178,8 @@ def extract_series(
         readouts: groups of channels, the same electrodes in all; `halves` and `quadrants` are those of the first.
 
     Raises:
-        UnusableData: if a finding refuses a recording, or recordings are of different cultures, unless `allow` names
-            it.
-        InvalidArgument: for conditions that cannot be read, a name in `allow` that is not a refusing finding, or
-            channels that do not form readouts.
+        UnusableData: if a finding refuses a recording, or all of them together, unless `allow` names it.
+        InvalidArgument: for conditions that cannot be read, another name in `allow`, or channels without readouts.
         Mismatch: for a recording whose channels do not read all electrodes of the readouts.
     """
     check_allowed(allow)

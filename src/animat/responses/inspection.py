@@ -151,8 +151,7 @@ def inspect_recording(
         name: what to call it; by default the source in its provenance.
 
     Raises:
-        InvalidArgument: for anything but a recording, a window that is not a stretch of time after the stimulus, or
-            conditions that cannot be read.
+        InvalidArgument: for a window that does not follow the stimulus, or conditions that cannot be read.
         UnusableData: for a recording without channels.
         Mismatch: for a window that differs from a table's.
     """

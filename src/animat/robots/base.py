@@ -85,9 +85,9 @@ class Quantity:
 class Robot(abc.ABC, Generic[State]):
     """A body with a task, driven by one or several motor commands u in [-1, 1] per iteration.
 
-    Implementations are frozen dataclasses whose fields are all parameters, with units in their names. They compare,
-    hash (so they are static under `jax.jit`) and convert to JSON. JAX is imported only when a robot first moves:
-    robots can be named, compared and stored without it.
+    Implementations are frozen dataclasses whose fields are all parameters, with units in their names; ours raise
+    InvalidArgument for one that is not finite or makes no sense. They compare, hash (so they are static under
+    `jax.jit`) and convert to JSON, without JAX, which is imported only when a robot first moves.
 
     `terminated` means that the task ended (fell, arrived). Reaching `episode_limit` is truncation: the program that
     runs the episode counts iterations, the robot never does.

@@ -51,9 +51,6 @@ class Cartpole(Robot[CartpoleState]):
         angle_limit_rad: the episode fails if the pole leans further, to either side.
         reward_failed: the reward of the iteration that fails, in place of `reward_upright`.
 
-    Raises:
-        InvalidArgument: for a parameter that is not finite or makes no sense.
-
     Source: Sawada et al. 2022, the cartpole task and its table of constants.
     """
 

@@ -185,9 +185,7 @@ def _expect_shape(what: str, value: Any, shape: tuple[int, ...], expected: str, 
         raise InvalidArgument(f"{what}: expected {expected}, shape {shape}, got {shown(value)}") from error
     if array.shape != shape:
         raise InvalidArgument(f"{what}: expected {expected}, shape {shape}, got shape {array.shape}")
-    if jnp.iscomplexobj(array):
-        raise InvalidArgument(f"{what}: expected {expected}, got {array.dtype}")
-    if dtype is bool and array.dtype != bool:
+    if jnp.iscomplexobj(array) or (dtype is bool and array.dtype != bool):
         raise InvalidArgument(f"{what}: expected {expected}, got {array.dtype}")
 
 

@@ -33,8 +33,7 @@ from animat.robots.base import LARGEST_SCALE, LEAST_SCALE, Robot
 from animat.robots.registry import REGISTRY as ROBOTS
 from animat.stimulation.protocol import Presentation
 from animat.tables import briefly
-from animat.training.provenance import expect_provenance
-from animat.training.settings import PulseCost
+from animat.training.settings import PulseCost, expect_provenance
 from animat.writing import write_whole
 
 FORMAT = "animat-policy-1"
