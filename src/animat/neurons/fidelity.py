@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from animat.neurons.memory import MemorySimulator
-from animat.neurons.simulator import HistogramSimulator, JointHistogramSimulator, NeuronSimulator
+from animat.neurons.simulator import HistogramSimulator, Index, JointHistogramSimulator, NeuronSimulator, Rates
 from animat.recordings.findings import Finding
 from animat.responses.responses import Responses
 
@@ -84,13 +84,11 @@ def fidelity(responses: Responses, simulator: NeuronSimulator) -> Fidelity:
 
 
 @jax.jit
-def _shares_after_each(
-    simulator: MemorySimulator, median_hz: Float[Array, "*readouts"]
-) -> Float[Array, "conditions *readouts"]:
+def _shares_after_each(simulator: MemorySimulator, median_hz: Rates) -> Float[Array, "conditions *readouts"]:
     """The share of answers to every condition that reach the median, over the histories of its own responses."""
     rows = jnp.arange(simulator.before.shape[1])
 
-    def of_condition(condition: Int[Array, ""]) -> Float[Array, "*readouts"]:
+    def of_condition(condition: Index) -> Rates:
         above = jnp.asarray(simulator.after_hz)[condition] >= median_hz
         before_each = jnp.concatenate([jnp.zeros((1, *above.shape[1:]), jnp.int32), jnp.cumsum(above, axis=0)])
         trace, load = jnp.asarray(simulator.histories)[condition].T

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Float64, Int, Int64
 
 from animat.arguments import checked_arguments
 from animat.neurons.history import NO_MEMORY, Memory, Ranked, trace_increment
-from animat.neurons.simulator import Answer, EmpiricalSimulator, Stored, fit_empirical, to_jax
+from animat.neurons.simulator import Answer, EmpiricalSimulator, Index, Rates, Scalar, Stored, fit_empirical, to_jax
 from animat.responses.responses import Responses
 from animat.tables import briefly
 
@@ -82,14 +82,12 @@ class MemorySimulator(EmpiricalSimulator):
         """The memory of a single recording's simulator, as `fit_memory` takes it."""
         return Memory(float(self.decay), float(self.weight), float(self.neighbour_exponent), float(self.load_s))
 
-    def answer(self, condition: Int[Array, ""], uniform: Float[Array, ""], history: Float[Array, "2"]) -> Answer:
+    def answer(self, condition: Index, uniform: Scalar, history: Float[Array, "2"]) -> Answer:
         load = jnp.asarray(self.kept)[condition] * history[1]
         rate_hz, trace = self.answer_at(condition, uniform, history[0], load)
         return Answer(rate_hz, jnp.stack([trace, load + jnp.asarray(self.added)]))
 
-    def answer_at(
-        self, condition: Int[Array, ""], uniform: Float[Array, ""], trace: Float[Array, ""], load: Float[Array, ""]
-    ) -> tuple[Float[Array, "*readouts"], Float[Array, ""]]:
+    def answer_at(self, condition: Index, uniform: Scalar, trace: Scalar, load: Scalar) -> tuple[Rates, Scalar]:
         """The response for the trace and load at the trial, and the trace after it."""
         first, end = self.rows_near(condition, trace, load)
         # float32 rounds a uniform just under 1 times a count up to the count.
@@ -97,9 +95,7 @@ class MemorySimulator(EmpiricalSimulator):
         trace = jnp.asarray(self.decay) * trace + jnp.asarray(self.left)[condition, row]
         return jnp.asarray(self.after_hz)[condition, row], trace
 
-    def rows_near(
-        self, condition: Int[Array, ""], trace: Float[Array, ""], load: Float[Array, ""]
-    ) -> tuple[Int[Array, ""], Int[Array, ""]]:
+    def rows_near(self, condition: Index, trace: Scalar, load: Scalar) -> tuple[Index, Index]:
         """The first row of `after_hz` to draw from for a trace and a load, and the row after the last."""
         before, count, nearest = self.before[condition], self.followers[condition], self.nearest[condition]
         toward = jnp.asarray(self.toward)[condition]

@@ -21,6 +21,9 @@ from animat.tables import briefly
 
 Stored: TypeAlias = Array | np.ndarray[Any, Any]
 """Arrays of a simulator: JAX's, or numpy's while it travels to another process."""
+Scalar: TypeAlias = Float[Array, ""]
+Index: TypeAlias = Int[Array, ""]
+Rates: TypeAlias = Float[Array, "*readouts"]
 LARGEST_BINS = 10_000
 """Most bins of a histogram: a draw compares with each edge, and a recording has some hundred responses."""
 PERCENTILES = tuple(range(0, 101, 10))
@@ -36,7 +39,7 @@ class Answer(NamedTuple):
         history: the history state, trace and load (`animat.neurons.history`), as `animat.neurons.memory` updates it.
     """
 
-    rate_hz: Float[Array, "*readouts"]
+    rate_hz: Rates
     history: Float[Array, "2"]
 
 
@@ -64,13 +67,13 @@ class NeuronSimulator(abc.ABC):
         return 1 if self.percentiles.ndim == 1 else int(self.percentiles.shape[0])
 
     @abc.abstractmethod
-    def quantile(self, condition: Int[Array, ""], uniform: Float[Array, ""]) -> Float[Array, "*readouts"]:
+    def quantile(self, condition: Index, uniform: Scalar) -> Rates:
         """The response x, in Hz per channel, below which the share `uniform` (in [0, 1)) of a condition's lies.
 
         With several readouts, which have no order, any function of a uniform that has their joint distribution.
         """
 
-    def answer(self, condition: Int[Array, ""], uniform: Float[Array, ""], history: Float[Array, "2"]) -> Answer:
+    def answer(self, condition: Index, uniform: Scalar, history: Float[Array, "2"]) -> Answer:
         """The answer to a condition, from a uniform in [0, 1), after a history state (see `Answer`).
 
         A simulator without memory answers the same after any history, and leaves the history unchanged.
@@ -85,8 +88,8 @@ class NeuronSimulator(abc.ABC):
 
     @final
     def sample(
-        self, key: PRNGKeyArray, condition: Int[Array, ""], history: ArrayLike | tuple[float, float] = INITIAL_HISTORY
-    ) -> Float[Array, "*readouts"]:
+        self, key: PRNGKeyArray, condition: Index, history: ArrayLike | tuple[float, float] = INITIAL_HISTORY
+    ) -> Rates:
         """Draw one response x to a condition, in Hz per channel, after a history state (see `Answer`)."""
         uniform = jax.random.uniform(key, dtype=jnp.float32)
         return self.answer(condition, uniform, jnp.asarray(history, jnp.float32)).rate_hz
@@ -115,13 +118,11 @@ class HistogramSimulator(NeuronSimulator):
     def n_conditions(self) -> int:
         return self.cumulative.shape[-2]
 
-    def quantile(self, condition: Int[Array, ""], uniform: Float[Array, ""]) -> Float[Array, ""]:
+    def quantile(self, condition: Index, uniform: Scalar) -> Scalar:
         return _quantile_of(self.cumulative[condition], self.edges_hz, uniform)
 
 
-def _quantile_of(
-    cumulative: Float[Stored, " edges"], edges_hz: Float[Stored, " edges"], uniform: Float[Array, ""]
-) -> Float[Array, ""]:
+def _quantile_of(cumulative: Float[Stored, " edges"], edges_hz: Float[Stored, " edges"], uniform: Scalar) -> Scalar:
     """The quantile of one histogram (see `HistogramSimulator`)."""
     # Twenty comparisons beat a binary search, and an empty bin is never chosen, as its two edges share a value.
     bin_ = jnp.sum(uniform >= cumulative[1:-1])
@@ -165,7 +166,7 @@ class JointHistogramSimulator(NeuronSimulator):
     def n_conditions(self) -> int:
         return self.counts.shape[-1]
 
-    def quantile(self, condition: Int[Array, ""], uniform: Float[Array, ""]) -> Float[Array, " readouts"]:
+    def quantile(self, condition: Index, uniform: Scalar) -> Float[Array, " readouts"]:
         """The responses of all readouts for the trial that a uniform in [0, 1) draws."""
         count = jnp.asarray(self.counts)[condition]
         # float32 rounds a uniform just under 1 times a count up to the count.
@@ -198,7 +199,7 @@ class EmpiricalSimulator(NeuronSimulator):
     def n_conditions(self) -> int:
         return self.counts.shape[-1]
 
-    def quantile(self, condition: Int[Array, ""], uniform: Float[Array, ""]) -> Float[Array, "*readouts"]:
+    def quantile(self, condition: Index, uniform: Scalar) -> Rates:
         count = self.counts[condition]
         # float32 rounds a uniform just under 1 times a count up to the count.
         row = jnp.minimum((uniform * count).astype(jnp.int32), count - 1)

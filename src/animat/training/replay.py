@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +11,11 @@ from jaxtyping import Array, Bool, Float, Int
 
 from animat.environment import Environment
 from animat.training.settings import SAC
+
+PerEnvironment: TypeAlias = Float[Array, " environments"]
+Flags: TypeAlias = Bool[Array, " environments"]
+States: TypeAlias = Float[Array, "environments state"]
+Rows: TypeAlias = Float[Array, "environments row"]
 
 
 class Batch(NamedTuple):
@@ -35,13 +40,8 @@ class Batch(NamedTuple):
 
 
 def pack_transitions(
-    settings: SAC,
-    state: Float[Array, "environments state"],
-    next_state: Float[Array, "environments state"],
-    action: Array,
-    reward: Float[Array, " environments"],
-    ended: Bool[Array, " environments"],
-) -> Float[Array, "environments row"]:
+    settings: SAC, state: States, next_state: States, action: Array, reward: PerEnvironment, ended: Flags
+) -> Rows:
     """Rows of the replay, from which `draw_batch` unpacks a `Batch`."""
     of_action = action.reshape(len(state), -1).astype(jnp.float32)
     row = jnp.stack([settings.reward_scale * reward, ended], axis=1, dtype=jnp.float32)
