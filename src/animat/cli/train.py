@@ -116,7 +116,6 @@ class Train(SimulatorOptions, JobOptions):
         return self._report(trained, timeline)
 
     def _training(self) -> tuple[Training, str | Readouts]:
-        """The training that the options describe, and the readouts."""
         from animat.coding.decoder import expect_fit
         from animat.coding.mapping import mapping_named
         from animat.goals.robot import with_goal
@@ -281,7 +280,6 @@ def _controllability(timeline: SimulatorTimeline) -> str:
 
 
 def _memories(timeline: SimulatorTimeline) -> Iterator[str]:
-    """What each memory simulator remembers."""
     import numpy as np
 
     from animat.neurons.history import NO_MEMORY

@@ -181,7 +181,6 @@ def _is_trained(group: Group, folder: Path) -> bool:
 def _train_in_memory(
     groups: Sequence[Group], progress: Progress, callbacks: Sequence[TrainingCallback]
 ) -> dict[str, Policy]:
-    """Train the groups in this process, one after the other."""
     trained: dict[str, Policy] = {}
     curves = Curves(None, groups, callbacks, progress)
     for number, group in enumerate(groups):

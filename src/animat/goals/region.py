@@ -181,7 +181,6 @@ def _quantity_named(name: str, spec: Mapping[str, Quantity]) -> Quantity:
 
 
 def _factor(unit: str, quantity: Quantity) -> float:
-    """The factor from a unit to a quantity's unit."""
     own_unit = "" if quantity.unit == "1" else quantity.unit
     if unit == own_unit:
         return 1.0

@@ -166,7 +166,6 @@ def fit_memory(responses: Responses, *, room: int | None = None, memory: Memory 
 
 
 def _find_memory(ranked: Ranked) -> Memory:
-    """The memory that predicts responses best, as described in `fit_memory`."""
     rows = [rows for rows in ranked.rows if len(rows) > 1]
     if not rows:
         return NO_MEMORY

@@ -193,7 +193,6 @@ class SessionView(View):
         }
 
     def _state(self) -> dict[str, Any]:
-        """The session's state, with a message."""
         silent_s = max(0.0, time.time() - self.file.stat().st_mtime)
         silent = f"nothing was written for {format_duration(silent_s)}"
         stop = (self.folder / STOP_FILE).exists()

@@ -97,7 +97,6 @@ def _artefact(
     spike_times_s: Float64[np.ndarray, " spikes"],
     stimulus_s: Float64[np.ndarray, " stimuli"],
 ) -> Bool[np.ndarray, " bins"]:
-    """The bins of the artefact; none if there is none."""
     edges_ms, count = histogram.edges_ms, histogram.count
     from_ms = edges_ms[:-1]
     above = (count > TIMES * usual) & (from_ms >= LOOKED_AT_MS[0]) & (from_ms < LOOKED_AT_MS[1])
