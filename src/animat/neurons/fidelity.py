@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from animat.neurons.memory import MemorySimulator
-from animat.neurons.simulator import HistogramSimulator, Index, JointHistogramSimulator, NeuronSimulator, Rates
+from animat.neurons.simulator import Histograms, Index, NeuronSimulator, Rates
 from animat.recordings.findings import Finding
 from animat.responses.responses import Responses
 
@@ -73,7 +73,7 @@ def fidelity(responses: Responses, simulator: NeuronSimulator) -> Fidelity:
     conditions = range(len(responses.conditions))
     in_data = np.array([np.mean(read_hz[kept & (responses.condition == c)] >= median_hz, axis=0) for c in conditions])
     above = 0
-    if isinstance(simulator, HistogramSimulator | JointHistogramSimulator):
+    if isinstance(simulator, Histograms):
         above = int(np.count_nonzero(read_hz[kept] > np.asarray(simulator.edges_hz)[..., -1]))
     labels = tuple(condition.label for condition in responses.conditions)
     if isinstance(simulator, MemorySimulator):

@@ -176,6 +176,9 @@ class JointHistogramSimulator(NeuronSimulator):
         return jax.vmap(_quantile_of)(cumulative, edges_hz, jnp.clip(shares, 0.0, _BELOW_ONE))
 
 
+Histograms: TypeAlias = HistogramSimulator | JointHistogramSimulator
+
+
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class EmpiricalSimulator(NeuronSimulator):

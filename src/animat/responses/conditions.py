@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import abc
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -245,9 +244,7 @@ def _parse(text: str) -> Conditions:
     )
 
 
-def _with_stimuli(
-    stimuli: Stimuli, index: Int64[np.ndarray, " stimuli"], conditions: Sequence[Condition]
-) -> Assignment:
+def _with_stimuli(stimuli: Stimuli, index: Int64[np.ndarray, " stimuli"], conditions: list[Condition]) -> Assignment:
     """An assignment whose conditions also describe their stimuli, unless they already do."""
     last = np.flatnonzero(stimuli.is_last_of_presentation)
     of = index[last]

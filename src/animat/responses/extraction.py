@@ -18,7 +18,7 @@ from animat.responses.quality.one_culture import series_findings
 from animat.responses.quality.responses import findings_on
 from animat.responses.readouts import ALL, Readouts, readouts_on
 from animat.responses.responses import Responses, Trials
-from animat.responses.windows import DEFAULT_WINDOW_MS, check_window, read_windows
+from animat.responses.windows import DEFAULT_WINDOW_MS, Window, check_window, read_windows
 
 SILENCE_S = 1.0
 """A longer time without a pulse is silence: the slowest of the paper's stimuli are 0.2 s apart."""
@@ -43,7 +43,7 @@ _NOTHING_TO_FIT = ("no-stimuli", "no-condition", "empty-condition")
 def extract_responses(
     source: Recording | ResponseTable,
     by: Conditions | str | None = None,
-    window_ms: tuple[float, float] = DEFAULT_WINDOW_MS,
+    window_ms: Window = DEFAULT_WINDOW_MS,
     burst_threshold: float | None = None,
     readouts: str | Readouts = ALL,
 ) -> Responses:
@@ -137,9 +137,7 @@ def extract_responses(
     return replace(responses, findings=(*assumed, *findings_on(responses, source, assignment, bursts, inside)))
 
 
-def _window_of(
-    table: ResponseTable, by: Conditions, window_ms: tuple[float, float]
-) -> tuple[tuple[float, float], tuple[Finding, ...]]:
+def _window_of(table: ResponseTable, by: Conditions, window_ms: Window) -> tuple[Window, tuple[Finding, ...]]:
     """The window in which a table's spikes were counted, and a finding if the table does not state it."""
     if table.window_ms is not None and window_ms not in (DEFAULT_WINDOW_MS, table.window_ms):
         raise Mismatch(
@@ -162,7 +160,7 @@ def _window_of(
 def extract_series(
     recordings: Sequence[Recording | ResponseTable],
     by: Conditions | str | None = None,
-    window_ms: tuple[float, float] | None = None,
+    window_ms: Window | None = None,
     *,
     burst_threshold: float | None = None,
     allow: Sequence[str] = (),

@@ -19,7 +19,7 @@ from animat.responses.conditions import Conditions
 from animat.responses.extraction import extract_responses
 from animat.responses.psth import ResponseTime, find_response, spontaneous_rate
 from animat.responses.responses import Responses
-from animat.responses.windows import DEFAULT_WINDOW_MS
+from animat.responses.windows import DEFAULT_WINDOW_MS, Window
 from animat.tables import briefly
 
 Verdict = Literal["usable", "usable with care", "not usable"]
@@ -140,7 +140,7 @@ class Inspection:
 def inspect_recording(
     recording: Recording | ResponseTable,
     by: Conditions | str | None = None,
-    window_ms: tuple[float, float] = DEFAULT_WINDOW_MS,
+    window_ms: Window = DEFAULT_WINDOW_MS,
     burst_threshold: float | None = None,
     name: str | None = None,
 ) -> Inspection:

@@ -12,7 +12,7 @@ from pydantic import Field
 from animat.errors import InvalidArgument, Mismatch, in_file, shown, some_of
 from animat.recordings.recording import Channels
 from animat.records import json_data, read_record, record
-from animat.responses.windows import Spiking, spikes_in
+from animat.responses.windows import PerWindow, Spiking, Window, spikes_in
 from animat.stimulation.places import CUT, count_places, electrodes_of, read_groups
 from animat.stimulation.selection import Electrode
 from animat.tables import UNKNOWN
@@ -83,11 +83,7 @@ class Readouts:
         return np.array([np.isin(channels.electrode, group) for group in self.electrodes])
 
     def read(
-        self,
-        recording: Spiking,
-        members: Bool[np.ndarray, "readouts channels"],
-        after_s: Float64[np.ndarray, " windows"],
-        window_ms: tuple[float, float],
+        self, recording: Spiking, members: Bool[np.ndarray, "readouts channels"], after_s: PerWindow, window_ms: Window
     ) -> Float64[np.ndarray, "windows *readouts"]:
         """The response x of each group in a window after each pulse, in Hz per channel.
 

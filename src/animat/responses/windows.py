@@ -12,6 +12,8 @@ from jaxtyping import Float64, Int64
 
 from animat.errors import InvalidArgument, expect_several, shown
 
+Window: TypeAlias = tuple[float, float]
+"""Start and end after a stimulus, in milliseconds."""
 DEFAULT_WINDOW_MS = (2.0, 10.0)
 """The paper's window: the first 2 ms after a stimulus are lost in its artefact."""
 HALF_NS_S = 0.5e-9
@@ -32,7 +34,7 @@ class Spiking(Protocol):
     def channels(self) -> Sized: ...
 
 
-def read_windows(recording: Spiking, after_s: PerWindow, window_ms: tuple[float, float]) -> tuple[PerWindow, PerWindow]:
+def read_windows(recording: Spiking, after_s: PerWindow, window_ms: Window) -> tuple[PerWindow, PerWindow]:
     """The response in a window after each pulse: its rate x and its ratio of active channels.
 
         x = S / (T N)
@@ -52,7 +54,7 @@ def read_windows(recording: Spiking, after_s: PerWindow, window_ms: tuple[float,
     return rate_hz, active / n_channels
 
 
-def check_window(window_ms: tuple[float, float]) -> tuple[float, float]:
+def check_window(window_ms: Window) -> Window:
     """The window, as a tuple; raises InvalidArgument unless it is a stretch of time after the stimulus."""
     words = "two numbers of milliseconds, start and end"
     several = expect_several("window_ms", window_ms, Real, words)

@@ -14,21 +14,7 @@ from animat.errors import InvalidArgument
 from animat.lazy import Array, Axes, jnp
 from animat.records import Number, record
 from animat.robots.base import Amount, Iterations, Quantity, Robot, Size, Transition, Uniforms
-from animat.robots.drawing import (
-    ACCENT,
-    AIM,
-    BODY,
-    DONE,
-    EDGE,
-    FAILED,
-    GOAL,
-    GOAL_FILL,
-    INK,
-    TRAIL,
-    Canvas,
-    Picture,
-    fit,
-)
+from animat.robots.drawing import ACCENT, AIM, BODY, EDGE, ENDED, GOAL, GOAL_FILL, INK, TRAIL, Canvas, Picture, fit
 from animat.robots.grid import Axis, Grid
 from animat.robots.motion import cost_of_distance, within_half_a_turn
 from animat.robots.registry import register_robot
@@ -214,7 +200,7 @@ class Navigation(Robot[NavigationState]):
         axes.add_patch(Circle(goal, self.goal_radius_m, color=AIM, alpha=0.35, linewidth=0))
         arrived = [math.hypot(*(path[-1, :2] - goal)) <= self.goal_radius_m for path in paths]
         for path, has_arrived in zip(paths, arrived, strict=True):
-            axes.plot(path[:, 0], path[:, 1], color=DONE if has_arrived else FAILED, linewidth=0.7, alpha=0.8)
+            axes.plot(path[:, 0], path[:, 1], color=ENDED[has_arrived], linewidth=0.7, alpha=0.8)
         axes.set_aspect("equal")
         axes.set_xlim(-0.03, self.arena_width_m + 0.03)
         axes.set_ylim(self.arena_height_m + 0.03, -0.03)

@@ -125,9 +125,8 @@ def expect_folder_for(training: Training, folder: Path) -> None:
 
 def is_finished(training: Training, folder: Path) -> bool:
     """Whether a training's folder holds all of its policies."""
-    return (folder / MANIFEST).exists() and all(
-        (folder / f"p{i}.safetensors").exists() for i in range(training.policies)
-    )
+    names = (MANIFEST, *(f"p{i}.safetensors" for i in range(training.policies)))
+    return all((folder / name).exists() for name in names)
 
 
 def write_description(folder: Path, manifest: dict[str, Any]) -> Path:

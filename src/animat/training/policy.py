@@ -10,7 +10,7 @@ from collections.abc import Mapping as Dict
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeAlias
 
 import numpy as np
 from jaxtyping import Float, Float32, Float64
@@ -49,6 +49,8 @@ _LARGEST = 1e6
 """Trained weights are of order one; with weights larger than this the outputs overflow."""
 
 Command = Annotated[Number, Field(ge=-1, le=1)]
+Action: TypeAlias = int | float | Float[np.ndarray, " commands"]
+"""The index of a condition (or command), or a continuous command."""
 
 FITTED = ("kind", "bins", "range_hz", "by", "burst_threshold")
 """The entries of `SimulatorTimeline.fitted` that determine a recording's simulator."""
@@ -219,19 +221,15 @@ class Policy:
         exponentials = np.exp(logits - logits.max())
         return exponentials / exponentials.sum()  # type: ignore[no-any-return]
 
-    def act(
-        self, observation: Float[np.ndarray, " observations"], rng: np.random.Generator
-    ) -> int | float | Float[np.ndarray, " commands"]:
-        """Draw an action for an observation in physical units: index of a condition or command, or a command."""
+    def act(self, observation: Float[np.ndarray, " observations"], rng: np.random.Generator) -> Action:
+        """Draw an action for an observation in physical units."""
         if self.n_actions is None:
             mean, log_std = np.split(self.outputs(observation).astype(np.float64), 2)
             return _squash(mean + np.exp(np.clip(log_std, -5.0, 2.0)) * rng.standard_normal(len(mean)))
         below = np.cumsum(self.probabilities(observation))
         return min(int(np.searchsorted(below, rng.random() * below[-1], side="right")), len(below) - 1)
 
-    def act_greedily(
-        self, observation: Float[np.ndarray, " observations"]
-    ) -> int | float | Float[np.ndarray, " commands"]:
+    def act_greedily(self, observation: Float[np.ndarray, " observations"]) -> Action:
         """The most probable action; for continuous commands tanh of the mean."""
         outputs = self.outputs(observation)
         if self.n_actions is not None:

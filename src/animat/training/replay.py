@@ -7,9 +7,10 @@ from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from animat.environment import Environment
+from animat.neurons.simulator import Index
 from animat.training.settings import SAC
 
 PerEnvironment: TypeAlias = Float[Array, " environments"]
@@ -50,9 +51,7 @@ def pack_transitions(
 
 @jax.custom_batching.custom_vmap
 def remember(
-    replay: Float[Array, "*policies transitions row"],
-    rows: Float[Array, "*policies environments row"],
-    at: Int[Array, ""],
+    replay: Float[Array, "*policies transitions row"], rows: Float[Array, "*policies environments row"], at: Index
 ) -> Float[Array, "*policies transitions row"]:
     """Write rows into a replay from row `at` on, which is the same for all policies that are trained side by side.
 
@@ -69,10 +68,7 @@ def _remember_each(size: int, is_batched: Sequence[bool], *arguments: Array) -> 
 
 
 def draw_batch(
-    environment: Environment[Any],
-    replay: Float[Array, "transitions row"],
-    available: Int[Array, ""],
-    uniforms: Float[Array, " batch"],
+    environment: Environment[Any], replay: Float[Array, "n row"], available: Index, uniforms: Float[Array, " batch"]
 ) -> Batch:
     """Draw transitions from the first `available` ones of a replay."""
     n, n_drawn = len(environment.observation_spec) + 1, environment.n_drawn
