@@ -71,9 +71,7 @@ class Cluster(Executor):
             _expect_listener(address)
             self._client = distributed.Client(address, timeout=_CONNECT_S, set_as_default=False)
         except (OSError, ValueError) as error:
-            raise AnimatError(
-                f"cluster: {where}: no scheduler answers ({first_line(error)}); start it again"
-            ) from error
+            raise AnimatError(f"cluster: {where}: no scheduler answers ({first_line(error)}); start it") from error
         self._refused: set[str] = set()
         self._futures: set[Future[Any]] = set()
         self._has_shared_folder, self._local = has_shared_folder, PinnedProcesses(own_cores()[-1:])

@@ -6,9 +6,8 @@ import os
 import shutil
 from collections.abc import Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
-from itertools import product
 from pathlib import Path
 from typing import final
 
@@ -25,20 +24,11 @@ from animat.neurons.timeline import SimulatorTimeline
 from animat.progress import Part, Progress, in_phase
 from animat.robots.host import HostRobot
 from animat.training.course import rows_of
-from animat.training.folder import (
-    MANIFEST,
-    TABLE,
-    describe,
-    expect_trainable,
-    groups_of,
-    is_ours,
-    write_assessments,
-    write_description,
-)
-from animat.training.group import BEST, CHECKPOINT_S, Group, train_groups
+from animat.training.folder import MANIFEST, describe, expect_trainable, finish, groups_of, is_ours, write_description
+from animat.training.group import CHECKPOINT_S, Group, train_groups
 from animat.training.policy import Policy
 from animat.training.specification import CHUNKS, Training
-from animat.writing import clear_away, exclusive_lock
+from animat.writing import exclusive_lock
 
 
 @checked_arguments
@@ -123,16 +113,7 @@ def train(
                     (folder / MANIFEST).unlink()
                 raise
         shutil.rmtree(folder / UNFINISHED, ignore_errors=True)
-        # In other subfolders another training may be writing.
-        for place, name in product((folder, folder / BEST), ("p*.safetensors", MANIFEST, TABLE)):
-            for leftover in place.glob(f".{name}.*.partial*"):
-                clear_away(leftover)
-        policies = {f"p{i}": Policy.load(folder / f"p{i}.safetensors") for i in range(training.policies)}
-        for name, policy in policies.items():
-            if len(policy.assessments):
-                policies[name] = replace(policy, best=Policy.load(folder / BEST / f"{name}.safetensors"))
-        if training.episodes_assessed and not (folder / TABLE).exists():
-            write_assessments(folder, policies)
+        policies = finish(training, folder)
         curves.finish(policies)
     return policies
 

@@ -85,9 +85,7 @@ def read_goal(text: str) -> Goal:
     """Parse a goal; `str` is the inverse. InvalidArgument names the objective that cannot be read."""
     clauses = [clause.strip() for clause in re.split("[;\n]", text) if clause.strip()]
     if not clauses:
-        raise InvalidArgument(
-            "goal: expected an objective, such as 'avoid pole_angle outside -12..12 deg', got nothing"
-        )
+        raise InvalidArgument("goal: expected an objective, such as 'avoid pole_angle outside -12..12 deg', got none")
     objectives = []
     with within("goal"):
         for clause in clauses:

@@ -45,9 +45,7 @@ class Range:
             raise InvalidArgument(f"{self.quantity}: expected {'both ends' if self.outside else 'an end'}, got none")
         if len(ends) == 2 and not ends[0] < ends[1]:
             given = "..".join(map(number, ends))
-            raise InvalidArgument(
-                f"{self.quantity}: expected the lower end first, got {given}, between which nothing lies"
-            )
+            raise InvalidArgument(f"{self.quantity}: expected the lower end first, got {given}, with nothing between")
 
     def __str__(self) -> str:
         ends = "..".join(number(end) for end in (self.low, self.high) if end is not None)

@@ -120,11 +120,8 @@ class Ranked:
             loads.append(kept * left)
             left = loads[-1] + 1
         # The time before the very first trial is infinite.
-        is_finite = np.isfinite(since_s)
-        usual_s = [
-            np.median(since_s[of] if (of := (presented.condition == c) & is_finite).any() else np.inf)
-            for c in range(len(self.rows))
-        ]
+        of_each = [np.isfinite(since_s) & (presented.condition == c) for c in range(len(self.rows))]
+        usual_s = [np.median(since_s[of]) if of.any() else np.inf for of in of_each]
         added = 0.5 / max(float(np.mean(loads)), 1e-9)
         every, after = added * np.array(loads), added * np.array(lefts)[self._place]
         return Loads(every, every[self._place], after, np.exp(-np.array(usual_s) / load_s), added)

@@ -73,9 +73,7 @@ class Readouts:
         read = set(channels.electrode.tolist()) - {UNKNOWN}
         for name, group in zip(self.names, self.electrodes, strict=True):
             if missing := sorted(set(group) - read):
-                known = (
-                    f"{len(read):,} are read ({some_of(sorted(read), 5)})" if read else "which are read is not known"
-                )
+                known = f"{len(read):,} are read ({some_of(sorted(read), 5)})" if read else "none is known"
                 raise Mismatch(
                     f"readouts: expected channels that read all electrodes of the readout {name!r}, got none for "
                     f"{len(missing)} of its {len(group)} ({some_of(missing, 5)}); {known}"

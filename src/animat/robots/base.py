@@ -183,11 +183,8 @@ WITHOUT = {
 
 def lacking(robot: Robot[Any]) -> dict[str, str]:
     """What is left out for this robot: a sentence for each missing method, by the method's name."""
-    return {
-        name: f"{without}: {robot.name} has no method `{name}`"
-        for name, without in WITHOUT.items()
-        if not hasattr(robot, name)
-    }
+    missing = {name: without for name, without in WITHOUT.items() if not hasattr(robot, name)}
+    return {name: f"{without}: {robot.name} has no method `{name}`" for name, without in missing.items()}
 
 
 def capability(robot: Robot[Any], name: str) -> Callable[..., Any]:

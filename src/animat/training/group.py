@@ -304,12 +304,10 @@ def _read_checkpoint(path: Path, fingerprint: str, like: Any) -> tuple[int, Any,
         # Opened here, as numpy does not close a file that it cannot read.
         with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
             # Checked before anything is read: an archive of some kilobytes can unpack to any size.
-            unpacked = sum(member.file_size for member in file.zip.infolist())
+            size = sum(member.file_size for member in file.zip.infolist())
             most = 2 * sum(leaf.size * leaf.dtype.itemsize for leaf in leaves) + 2**22
-            if unpacked > most:
-                raise InvalidFile(
-                    f"{path}: expected a checkpoint of at most {most:,} bytes, got {unpacked:,}; remove it"
-                )
+            if size > most:
+                raise InvalidFile(f"{path}: expected a checkpoint of at most {most:,} bytes, got {size:,}; remove it")
             if str(file["fingerprint"]) != fingerprint:
                 raise InvalidFile(f"{path}: expected a checkpoint of this training, got another training's; remove it")
             arrays = [file[f"leaf{i}"] for i in range(sum(name.startswith("leaf") for name in file.files))]

@@ -142,9 +142,7 @@ class Policy:
                 raise InvalidArgument(f"{name}: expected float32, got {', '.join(kinds)}")
             # Also false for NaN.
             if name != "scales" and not all(np.all(np.abs(array) <= _LARGEST) for array in arrays):
-                raise InvalidArgument(
-                    f"{name}: expected finite numbers up to {_LARGEST:g}, got NaN, infinite or larger ones"
-                )
+                raise InvalidArgument(f"{name}: expected finite numbers up to {_LARGEST:g}, got NaN or larger ones")
         if not np.all((self.scales >= LEAST_SCALE) & (self.scales <= LARGEST_SCALE)):
             raise InvalidArgument(
                 f"scales: expected numbers from {LEAST_SCALE:g} to {LARGEST_SCALE:g}, got {self.scales.tolist()}"

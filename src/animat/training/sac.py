@@ -290,9 +290,8 @@ def learn(
         targets = jax.tree.map(lambda t, c: t + settings.tau * (c - t), targets, trained.critics)
         return (trained, targets, optimiser), None
 
-    (trained, targets, optimiser), _ = jax.lax.scan(
-        update, (learner.trained, learner.targets, learner.optimiser), uniforms
-    )
+    before = learner.trained, learner.targets, learner.optimiser
+    (trained, targets, optimiser), _ = jax.lax.scan(update, before, uniforms)
     rate = (settings.averaging_exponent + 1.0) / (index + 1.0 + settings.averaging_exponent)
     deployed = jax.tree.map(lambda average, new: average + rate * (new - average), learner.deployed, trained.actor)
     return learner._replace(trained=trained, deployed=deployed, targets=targets, optimiser=optimiser)

@@ -185,12 +185,9 @@ class CulturesView(View):
         return {name: text(error) for name, error in list(failed.items())[:_MOST_CULTURES] if _is_name(name)}
 
     def _names(self) -> list[str]:
+        cultures = listed(json_of(self.file).get("cultures"))
         # A link may lead out of the folder.
-        names = [
-            name
-            for name in listed(json_of(self.file).get("cultures"))
-            if _is_name(name) and not (self.folder / name).is_symlink()
-        ]
+        names = [name for name in cultures if _is_name(name) and not (self.folder / name).is_symlink()]
         if not names:
             raise InvalidFile(f"{self.file}: expected the names of cultures, got none")
         return names[:_MOST_CULTURES]

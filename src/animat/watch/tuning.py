@@ -108,9 +108,7 @@ def _chart(trials: list[dict[str, Any]], until: int | None) -> dict[str, Any]:
 
 
 def _table(trials: list[dict[str, Any]]) -> dict[str, Any]:
-    rows = [
-        [t["trial"], _STATES.get(t["state"], t["state"]), t["last"], settings(t["settings"])]
-        for t in trials[::-1][:_MOST_SHOWN]
-    ]
+    newest = trials[::-1][:_MOST_SHOWN]
+    rows = [[t["trial"], _STATES.get(t["state"], t["state"]), t["last"], settings(t["settings"])] for t in newest]
     head = ["trial", "state", "mean return", "settings"]
     return table("Journal", head, rows, "" if rows else "no trial is done yet", width="whole")
