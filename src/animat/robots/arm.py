@@ -67,8 +67,7 @@ class TwoLinkArm(Robot[ArmState]):
         target_radius_m: R.
 
     Raises:
-        InvalidArgument: for a parameter that is not finite or makes no sense, links too different in length to reach
-            a target, or a step too long for the equations.
+        InvalidArgument: for links too different in length to reach a target, or a step too long for the equations.
 
     Source: any robotics textbook, the manipulator with two revolute joints; the task is that of Gymnasium's
     `Reacher-v5`, and of the drawing arm Meart (Bakkum et al. 2007).

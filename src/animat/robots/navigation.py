@@ -44,7 +44,7 @@ class Navigation(Robot[NavigationState]):
         goal_x_m, goal_y_m: from the top-left corner, to the right and down.
 
     Raises:
-        InvalidArgument: for a parameter that is not finite or makes no sense, or a goal outside the arena.
+        InvalidArgument: for a goal outside the arena.
 
     Source: Sawada et al. 2022, the navigation task.
     """

@@ -49,7 +49,7 @@ class SwingUp(Robot[SwingUpState]):
         reward_upright: the reward of an iteration that ends there.
 
     Raises:
-        InvalidArgument: for a parameter that is not finite or makes no sense, or a step that allows a whole turn.
+        InvalidArgument: for a step in which the rod could make a whole turn.
 
     Source: the pendulum of Gymnasium (`Pendulum-v1`) with another reward.
     """

@@ -68,8 +68,8 @@ class Wheels(Robot[WheelsState]):
         reward_bump: of an iteration in which it could not move.
 
     Raises:
-        InvalidArgument: for a parameter that is not finite or makes no sense, a start without room or without goals
-            within reach, walls that do not close, or a step so long that the robot could pass through a wall.
+        InvalidArgument: for a start without room or without goals within reach, walls that do not close, or a step so
+            long that the robot could pass through a wall.
 
     Source: Mondada et al. 2009, the e-puck (body, wheels and sensors, which here measure distance).
     """

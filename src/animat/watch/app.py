@@ -23,7 +23,7 @@ from starlette.websockets import WebSocket
 
 from animat.errors import AnimatError, InvalidArgument, first_line
 from animat.watch.discovery import find, place_within
-from animat.watch.plain import text
+from animat.watch.files import text
 from animat.watch.recording import RecordingView
 from animat.watch.session import SessionView, stop_session
 from animat.watch.study import CulturesView, StudyView
@@ -32,7 +32,6 @@ from animat.watch.tuning import TuningView
 from animat.watch.view import View
 
 _MOST_VIEWS = 8
-"""Most views kept open."""
 _VIEWS: dict[str, type[View]] = {
     view.kind: view for view in (SessionView, TrainingView, StudyView, CulturesView, TuningView, RecordingView)
 }
@@ -51,7 +50,6 @@ _HEADERS = {
     "cross-origin-resource-policy": "same-origin",
     "cache-control": "no-store",
 }
-"""Headers of every response."""
 
 
 class Watched:

@@ -26,7 +26,7 @@ from animat.robots.base import Robot
 from animat.robots.drawing import draw_robot
 from animat.stimulation.stimulus import NOTHING
 from animat.watch.discovery import is_locked
-from animat.watch.plain import mapped, number, numbers, packed, text
+from animat.watch.files import mapped, number, numbers, packed, text
 from animat.watch.tail import PercentilesSince, Sums, Tail, by_agent, first_readout
 from animat.watch.view import View, time_left
 

@@ -9,10 +9,9 @@ from typing import Any
 
 from animat.errors import InvalidFile
 from animat.watch.discovery import state_of
-from animat.watch.files import json_of, text_of
-from animat.watch.plain import listed, mapped, number, settings, short, text
+from animat.watch.files import json_of, listed, mapped, number, text, text_of
 from animat.watch.study import running_jobs, running_table
-from animat.watch.view import View, chart, curve, facts, in_blocks, table, time_left
+from animat.watch.view import View, chart, curve, facts, in_blocks, settings, short, table, time_left
 
 _MOST_SHOWN = 300
 _STATES = {"complete": "complete", "stopped": "stopped early", "diverged": "diverged"}
