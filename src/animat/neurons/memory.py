@@ -55,8 +55,7 @@ class MemorySimulator(EmpiricalSimulator):
         added: c, what a trial adds to the load.
         decay, weight, neighbour_exponent, load_s: as in `Memory`.
 
-    Source: the nearest-neighbour bootstrap of Lall and Sharma 1996 (doi:10.1029/95WR02966), with neighbours in a single
-    number and without its weights.
+    Source: the nearest-neighbour bootstrap of Lall and Sharma 1996 (doi:10.1029/95WR02966), of one number, unweighted.
     """
 
     __repr__ = briefly

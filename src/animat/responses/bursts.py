@@ -56,8 +56,7 @@ def otsu_threshold(values: Float64[np.ndarray, " values"]) -> float:
     the edges of a histogram. The first of several equally good cuts is taken. If all values are equal there is nothing
     to cut, and the threshold is that value; without values it is NaN.
 
-    Source: Otsu, "A threshold selection method from gray-level histograms", IEEE Trans. SMC 9 (1979), 62-66,
-    doi:10.1109/TSMC.1979.4310076.
+    Source: Otsu 1979, "A threshold selection method from gray-level histograms", doi:10.1109/TSMC.1979.4310076.
     """
     distinct, counts = np.unique(values, return_counts=True)
     if len(distinct) < 2:

@@ -237,9 +237,8 @@ class Policy:
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the policy as safetensors, with everything that is not an array as JSON in its metadata.
 
-        Raises:
-            InvalidFile: if it cannot be written; an existing file is left unchanged.
-            InvalidArgument: for a robot or a mapping that is not registered, as the file could not be loaded.
+        Raises InvalidFile if it cannot be written, which leaves an existing file unchanged, and InvalidArgument for a
+        robot or a mapping that is not registered, as the file could not be loaded.
         """
         from safetensors.numpy import save
 
@@ -275,9 +274,8 @@ class Policy:
     def load(path: str | os.PathLike[str]) -> Policy:
         """Read a policy that `save` wrote.
 
-        Raises:
-            InvalidFile: if the file is missing, damaged, or not a policy in this format; or if its robot or mapping is
-                not registered here, with what to import.
+        Raises InvalidFile if it is missing, damaged, or not a policy in this format; or, with what to import, if its
+        robot or mapping is not registered here.
         """
         path = expect_plain_file(path, _MOST_BYTES)
         arrays, description = _read(path)
