@@ -177,7 +177,7 @@ def extract_series(
 
     Raises:
         UnusableData: if a finding refuses a recording, or all of them together, unless `allow` names it.
-        InvalidArgument: for conditions that cannot be read, another name in `allow`, or channels without readouts.
+        InvalidArgument: for conditions that cannot be read, another name in `allow`, or channels that form no readouts.
         Mismatch: for a recording whose channels do not read all electrodes of the readouts.
     """
     check_allowed(allow)

@@ -26,13 +26,9 @@ Transition: TypeAlias = tuple[State, "Float[Array, '']", "Bool[Array, '']"]
 LONGEST_EPISODE = 1_000_000
 """Most iterations of an episode: each has its own random key, drawn before the first."""
 
-
-def _to_whole(value: Any) -> Any:
-    # The command line and files have 120.0 for 120.
-    return int(value) if isinstance(value, float) and value.is_integer() else value
-
-
-Iterations = Annotated[Whole, Field(ge=1, le=LONGEST_EPISODE), BeforeValidator(_to_whole)]
+# The command line and files have 120.0 for 120.
+_TO_WHOLE = BeforeValidator(lambda value: int(value) if isinstance(value, float) and value.is_integer() else value)
+Iterations = Annotated[Whole, Field(ge=1, le=LONGEST_EPISODE), _TO_WHOLE]
 Size = Annotated[Number, Field(ge=1e-9, le=1e9)]
 Amount = Annotated[Number, Field(ge=0, le=1e9)]
 """Types of a robot's parameters: a size is never 0."""

@@ -220,8 +220,6 @@ def _series(curves: Curves, column: str) -> tuple[list[dict[str, Any]], float | 
     values = np.full((len(curves), len(longest)), np.nan)
     for row, rows in zip(values, curves.values(), strict=True):
         row[: len(rows)] = rows[:, at]
-    known = np.isfinite(values)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        mean = np.where(known, values, 0.0).sum(axis=0) / known.sum(axis=0)
+    mean = np.ma.masked_invalid(values).mean(axis=0).filled(np.nan)
     series.append(curve("mean of the policies", longest[:, 0].tolist(), mean.tolist(), "line", "blue"))
     return series, next((x for x in mean[::-1].tolist() if np.isfinite(x)), None)
