@@ -271,11 +271,8 @@ def _controllability(timeline: SimulatorTimeline) -> str:
         text = ", ".join(f"{c.label}: {row}" for c, row in zip(timeline.conditions, rows, strict=True))
     at = f"in the simulator at {in_min(timeline.start_min[0])}"
     first = f"P(x >= P50), the share of responses that reach the median, {at}: {text}"
-    difference = [
-        f"in the recording, before the simulator draws from it, {f.message}"
-        for f in timeline.findings
-        if f.name == "difference"
-    ][:1]
+    found = [finding.message for finding in timeline.findings if finding.name == "difference"]
+    difference = [f"in the recording, before the simulator draws from it, {message}" for message in found[:1]]
     return "\n".join([first, *difference, *_memories(timeline)])
 
 

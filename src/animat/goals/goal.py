@@ -119,13 +119,11 @@ class Ball:
     unit: str = ""
 
     def __post_init__(self) -> None:
-        if len(self.centre) != len(self.quantities):
-            raise InvalidArgument(
-                f"{', '.join(self.quantities)}: expected a centre of {len(self.quantities)} numbers, got "
-                f"{len(self.centre)}"
-            )
-        if len(set(self.quantities)) < len(self.quantities):
-            raise InvalidArgument(f"{', '.join(self.quantities)}: expected each quantity once")
+        names, n = ", ".join(self.quantities), len(self.quantities)
+        if len(self.centre) != n:
+            raise InvalidArgument(f"{names}: expected a centre of {n} numbers, got {len(self.centre)}")
+        if len(set(self.quantities)) < n:
+            raise InvalidArgument(f"{names}: expected each quantity once")
 
     def __str__(self) -> str:
         centre = ", ".join(map(number, self.centre))

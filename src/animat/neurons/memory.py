@@ -221,9 +221,8 @@ def _slopes(
 
     Source: Morris 1983 (doi:10.1080/01621459.1983.10477920).
     """
-    centred = [
-        (rank - rank.mean(), history - history.mean(axis=0)) for rank, history in zip(ranks, histories, strict=True)
-    ]
+    pairs = zip(ranks, histories, strict=True)
+    centred = [(rank - rank.mean(), history - history.mean(axis=0)) for rank, history in pairs]
     squares = np.array([x.T @ x for _, x in centred])
     products = np.array([x.T @ y for y, x in centred])
     common = np.linalg.lstsq(squares.sum(axis=0), products.sum(axis=0), rcond=None)[0]

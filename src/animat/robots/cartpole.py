@@ -119,9 +119,8 @@ class Cartpole(Robot[CartpoleState]):
             angle + self.step_s * angular_velocity,
             angular_velocity + self.step_s * angular_acceleration,
         )
-        terminated = (jnp.abs(after.position_m) > self.track_length_m / 2) | (
-            jnp.abs(after.angle_rad) > self.angle_limit_rad
-        )
+        is_off_track = jnp.abs(after.position_m) > self.track_length_m / 2
+        terminated = is_off_track | (jnp.abs(after.angle_rad) > self.angle_limit_rad)
         reward = jnp.where(terminated, self.reward_failed, self.reward_upright).astype(position.dtype)
         return after, reward, terminated
 

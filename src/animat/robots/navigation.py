@@ -193,9 +193,8 @@ class Navigation(Robot[NavigationState]):
         """The robot's path in each episode, seen from above."""
         from matplotlib.patches import Circle, Rectangle
 
-        axes.add_patch(
-            Rectangle((0, 0), self.arena_width_m, self.arena_height_m, fill=False, color=EDGE, linewidth=0.8)
-        )
+        arena = Rectangle((0, 0), self.arena_width_m, self.arena_height_m, fill=False, color=EDGE, linewidth=0.8)
+        axes.add_patch(arena)
         goal = (self.goal_x_m, self.goal_y_m)
         axes.add_patch(Circle(goal, self.goal_radius_m, color=AIM, alpha=0.35, linewidth=0))
         arrived = [math.hypot(*(path[-1, :2] - goal)) <= self.goal_radius_m for path in paths]

@@ -195,7 +195,5 @@ def groups_of(
     training.environment_on(timeline)
     if timeline is not None:
         timeline = replace(timeline, simulators=jax.device_get(timeline.simulators))
-    return [
-        Group(training, members, timeline, manifest["fingerprint"], provenance_of(manifest))
-        for members in split_groups(training.policies, fewest=fewest)
-    ]
+    parts = split_groups(training.policies, fewest=fewest)
+    return [Group(training, members, timeline, manifest["fingerprint"], provenance_of(manifest)) for members in parts]

@@ -274,9 +274,8 @@ class SideBySide:
         if checkpoints[1:]:
             n = len(self._places) // len(checkpoints)
             like = jax.eval_shape(lambda: jax.tree.map(lambda leaf: leaf[:n], like))
-        (done, (learners, course_state), curve), *others = (
-            _read_checkpoint(path, self.fingerprint, like) for path in checkpoints
-        )
+        read = [_read_checkpoint(path, self.fingerprint, like) for path in checkpoints]
+        (done, (learners, course_state), curve), *others = read
         if others:
             learners = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), learners, *(each[1][0] for each in others))
             curve = np.concatenate([curve, *(each[2] for each in others)], axis=1)
