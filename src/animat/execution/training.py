@@ -59,8 +59,7 @@ def train(
         workers: processes, each pinned to its own core; None: one per core. Not with an executor.
         executor: for the groups of policies; it must see the folder, and stays open. None: processes on this machine.
         checkpoint_s: seconds between checkpoints, which a kill may cost; never changes the result.
-        sources, random_return: for the manifest: names of the recordings, and the mean return of random actions, a line
-            in the live page's learning curves.
+        sources, random_return: names of the recordings and mean return of random actions, for manifest and live page.
         callbacks: called with every row of the learning curves as it is produced; they change no bit.
 
     Returns:

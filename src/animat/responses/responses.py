@@ -63,8 +63,7 @@ class Responses:
         presentation: how stimuli were presented; None if it is not known.
         start_min: start of the recording on the culture's clock, in minutes.
         time_s: of the pulse before each response, on the recording's clock, shape (responses,); None if not known.
-        presented: all trials of the recording, including those without a condition; None: these responses are all, in
-            close succession (see `presentations`).
+        presented: all trials, including those without a condition; None: these responses are all (see `presentations`).
         place: the index of each response among them, shape (responses,).
         by: the rule that sorted stimuli into conditions, as `conditions_named` reads it; None if it is not known.
         burst_threshold: the given threshold; None: it is Otsu's.

@@ -65,8 +65,7 @@ class Learner(NamedTuple):
 class Finished(NamedTuple):
     """The number of the policy's episodes that ended in a chunk, and the sum of their returns, in the task's units.
 
-    The costs of trials (`animat.wrappers.TrialCosts`) are not subtracted. Episodes in which actions were held
-    (`animat.training.exploration`) are excluded.
+    Costs of trials (`TrialCosts`) are not subtracted; episodes in which actions were held (`Exploration`) are excluded.
     """
 
     episodes: Float[Array, ""]

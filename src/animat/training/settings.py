@@ -42,8 +42,7 @@ class SAC:
         discount: gamma.
         tau: fraction by which the target critics move towards the critics at each gradient step.
         reward_scale: factor applied to rewards inside the learner only.
-        averaging_exponent: exponent of polynomial-decay averaging; the deployed actor is an average over about the last
-            1 / (averaging_exponent + 1) of its training so far.
+        averaging_exponent: of polynomial-decay averaging, over about the last 1 / (averaging_exponent + 1) of training.
         initial_alpha: weight of the entropy bonus at the start.
         target_entropy_ratio: target entropy of discrete actions, as a share of the largest possible, log(actions).
         entropy_nats: target entropy of a continuous action, per command.
