@@ -119,8 +119,9 @@ def _results_of(path: Path) -> list[list[Any]]:
     robot, arm = path.parts[-3:-1]
     if path.suffix == ".npz":
         names = "return", "actor", "over_time", "agent", "at_min"
-        # There are none in a file that cannot be read, which raises an error.
-        returns, actors, over_time, agents, at_min = arrays_in(path, names, _MOST_EPISODES_BYTES) or []
+        if (arrays := arrays_in(path, names, _MOST_EPISODES_BYTES)) is None:
+            raise InvalidFile(f"{path}: expected the episodes of an arm")
+        returns, actors, over_time, agents, at_min = arrays
         # Episodes over time are few per recording, and a comparison's episodes may be on another recording.
         own = ~over_time.astype(bool) & (agents == "policy") & (at_min == at_min.max(initial=-np.inf))
         return (
