@@ -290,7 +290,7 @@ def _observed(name: str, space: Any) -> list[float]:
 def measured_scales(robot: HostRobot, bounds: Sequence[float]) -> tuple[float, ...]:
     """The scale of each observed number: its bound, or, where that is 0 (not known), its root mean square.
 
-    Over random commands, to two digits, because processors round differently; 1 for a number that is always 0.
+    That is over random commands, and 1 for a number that is always 0. It has two digits: processors round differently.
     """
     if all(bounds):
         return tuple(map(float, bounds))
