@@ -22,7 +22,7 @@ import numpy as np
 import pytest
 
 from animat.cli import COMMANDS, main
-from animat.cli.responses import print_warnings
+from animat.cli.command import print_warnings
 from animat.cli.train import Train
 from animat.coding.mapping import Thresholds
 from animat.cultures.series import Series

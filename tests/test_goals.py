@@ -18,8 +18,7 @@ from animat.environment import Environment, WithoutNeurons
 from animat.errors import InvalidArgument
 from animat.evaluation.optimum import _Programme, _Tables, best_return
 from animat.evaluation.rollouts import Constant, roll_out
-from animat.goals.goal import Goal, Objective, read_goal
-from animat.goals.region import Ball, Range
+from animat.goals.goal import Ball, Goal, Objective, Range, read_goal
 from animat.goals.robot import RobotWithGoal, body_and_goal, robot_of, with_goal, without_goal
 from animat.progress import Silent
 from animat.robots import Cartpole, GymnasiumRobot, Navigation, Quantity, Robot, Shuttle, SwingUp, robot_named

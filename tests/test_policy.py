@@ -22,7 +22,7 @@ from safetensors import safe_open
 from safetensors.numpy import load, save
 from scipy import stats
 
-from animat.cli.responses import simulator_settings
+from animat.cli.command import simulator_settings
 from animat.closed_loop.loop import Loop
 from animat.coding.mapping import mapping_named
 from animat.errors import InvalidArgument, InvalidFile, UnusableData
@@ -34,7 +34,7 @@ from animat.robots.navigation import Navigation
 from animat.stimulation.protocol import Presentation
 from animat.training.networks import Layer, forward
 from animat.training.policy import Policy, load_policies
-from animat.training.provenance import SimulatorProvenance, TrainingProvenance
+from animat.training.settings import SimulatorProvenance, TrainingProvenance
 from animat.training.specification import Percentiles
 from animat.wrappers import Delivery
 

@@ -176,7 +176,7 @@ def test_a_budget_counts_what_is_delivered() -> None:
         account.spend([REST])
     account.spend([REST, PULSE])
     assert (account.pulses, account.most_on_an_electrode) == (1, 1)
-    with pytest.raises(BudgetSpent, match="1 of 1 pulses are spent, and 1 more were wanted"):
+    with pytest.raises(BudgetSpent, match="1 of 1 pulses are spent, and 1 more was wanted"):
         account.check([REST, PULSE])
     account.take_back([REST, PULSE])
     assert account.pulses == 0

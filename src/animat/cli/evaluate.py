@@ -9,7 +9,7 @@ from typing import Any
 
 from tyro.conf import Positional
 
-from animat.cli.responses import SimulatorOptions, policies_for, print_warnings
+from animat.cli.command import SimulatorOptions, policies_for, print_warnings
 from animat.errors import AnimatError, InvalidArgument
 from animat.plain_file import read_plain_text
 from animat.records import json_data, write_json

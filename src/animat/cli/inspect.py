@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional
 
-from animat.cli.responses import ResponseOptions, print_warnings
+from animat.cli.command import ResponseOptions, print_warnings
 from animat.errors import AnimatError, InvalidArgument, Mismatch, UnusableData, within
 from animat.progress import Bar, Part, Progress
 from animat.writing import expect_writable

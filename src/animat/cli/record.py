@@ -138,7 +138,6 @@ def _expect_no_others(folder: Path) -> None:
 
 
 def _warn_too_fast(protocol: Protocol) -> None:
-    """Warn of frequencies whose next pulse comes before the response window ends."""
     from animat.responses.windows import DEFAULT_WINDOW_MS
 
     fast = [f"{hz:g} Hz" for hz in protocol.frequencies_hz if 1000 / hz < DEFAULT_WINDOW_MS[1]]

@@ -8,7 +8,7 @@ from typing import Any
 
 from tyro.conf import Positional
 
-from animat.cli.responses import SimulatorOptions, policies_for
+from animat.cli.command import SimulatorOptions, policies_for
 from animat.errors import InvalidArgument, InvalidFile, Mismatch
 from animat.plain_file import is_absent
 

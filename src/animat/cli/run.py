@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional
 
-from animat.cli.command import StimulationOptions, expect_no_fault
-from animat.cli.responses import policies_for, simulator_settings
+from animat.cli.command import StimulationOptions, expect_no_fault, policies_for, simulator_settings
 from animat.errors import InvalidArgument, Mismatch, UnsafeStimulus, expect_at_least, in_min
 from animat.plain_file import expect_no_file
 from animat.progress import Bar, Progress
@@ -184,10 +183,7 @@ class Run(StimulationOptions):
         expect_no_fault(gap.session, self.out)
 
     def _protocol(self, recordings: Sequence[Recording], calibrating: Recording) -> tuple[Protocol, list[Finding]]:
-        """The protocol with the pulse and number of patterns, and a warning if the recordings do not state them.
-
-        It is that of the calibrating recording, else of --protocol, else the usual one.
-        """
+        """The protocol of the calibrating recording, else of --protocol, else the usual one, with a warning."""
         from animat.cultures.kinds import pulse_for
         from animat.stimulation.protocol import CLOSED_LOOP, read_protocol
 

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional
 
-from animat.cli.command import JobOptions, read_numbers, read_sac
-from animat.cli.responses import SimulatorOptions, print_warnings
+from animat.cli.command import JobOptions, SimulatorOptions, print_warnings, read_numbers, read_sac
 from animat.errors import InvalidArgument, UnusableData, counted, expect_at_least, in_file, in_min
 from animat.records import as_json
 from animat.writing import expect_writable
@@ -117,7 +116,6 @@ class Train(SimulatorOptions, JobOptions):
         return self._report(trained, timeline)
 
     def _training(self) -> tuple[Training, str | Readouts]:
-        """The training that the options describe, and the readouts."""
         from animat.coding.decoder import expect_fit
         from animat.coding.mapping import mapping_named
         from animat.goals.robot import with_goal
@@ -273,16 +271,12 @@ def _controllability(timeline: SimulatorTimeline) -> str:
         text = ", ".join(f"{c.label}: {row}" for c, row in zip(timeline.conditions, rows, strict=True))
     at = f"in the simulator at {in_min(timeline.start_min[0])}"
     first = f"P(x >= P50), the share of responses that reach the median, {at}: {text}"
-    difference = [
-        f"in the recording, before the simulator draws from it, {f.message}"
-        for f in timeline.findings
-        if f.name == "difference"
-    ][:1]
+    found = [finding.message for finding in timeline.findings if finding.name == "difference"]
+    difference = [f"in the recording, before the simulator draws from it, {message}" for message in found[:1]]
     return "\n".join([first, *difference, *_memories(timeline)])
 
 
 def _memories(timeline: SimulatorTimeline) -> Iterator[str]:
-    """What each memory simulator remembers."""
     import numpy as np
 
     from animat.neurons.history import NO_MEMORY

@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from tyro.conf import Positional
 
-from animat.cli.responses import ResponseOptions, print_warnings
+from animat.cli.command import ResponseOptions, print_warnings
 from animat.errors import Mismatch, UnusableData, expect_at_least, within
 from animat.writing import expect_writable
 

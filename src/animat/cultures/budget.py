@@ -63,14 +63,14 @@ class Account:
             if self._on[electrode] + more > most:
                 raise BudgetSpent(
                     f"budget.pulses_per_electrode: electrode {electrode} had {self._on[electrode]} of {most} pulses, "
-                    f"and {more} more were wanted"
+                    f"and {_more(more)} wanted"
                 )
 
     def check_number(self, wanted: int) -> None:
         """Raise `BudgetSpent` unless the budget covers this many more pulses, on any electrodes."""
         most = self.budget.pulses
         if most is not None and self.pulses + wanted > most:
-            raise BudgetSpent(f"budget.pulses: {self.pulses} of {most} pulses are spent, and {wanted} more were wanted")
+            raise BudgetSpent(f"budget.pulses: {self.pulses} of {most} pulses are spent, and {_more(wanted)} wanted")
 
     def spend(self, stimuli: Sequence[Stimulus]) -> None:
         """Enter stimuli as delivered."""
@@ -144,6 +144,10 @@ class _HandedOver:
 def _pulses(stimuli: Sequence[Stimulus]) -> int:
     """How many of the stimuli are delivered, rests aside."""
     return sum(not stimulus.is_rest for stimulus in stimuli)
+
+
+def _more(pulses: int) -> str:
+    return f"{pulses} more {'was' if pulses == 1 else 'were'}"
 
 
 def _counted(stimuli: Sequence[Stimulus]) -> Counter[int]:

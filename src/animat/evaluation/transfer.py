@@ -102,9 +102,10 @@ def no_memory(noticed: Iterable[Finding], presentation: Presentation | None, *, 
     remembers = next((finding for finding in noticed if finding.name == "memory"), None)
     if remembers is None or has_memory:
         return
+    # The finding on recordings in blocks has its remedy already.
     blocked = presentation is not None and presentation.order == "blocked"
-    remedy = "record with --order mixed" if blocked else "--simulator memory"
-    message = f"{remembers.message}: the measured return may differ from the prediction ({remedy})"
+    remedy = "" if blocked else " (--simulator memory)"
+    message = f"{remembers.message}: the measured return may differ from the prediction{remedy}"
     yield Finding("no-memory", "warning", message, remembers.value)
 
 

@@ -51,8 +51,7 @@ class Cluster(Executor):
     Args:
         where: the scheduler's address, or the file to which it wrote its address (`dask scheduler --scheduler-file`).
         longest_s: longest duration of a batch of small calls; 0: no batches.
-        has_shared_folder: whether workers see the folder of a task at the same place; if not, the files that tasks read
-            and write go through this process.
+        has_shared_folder: whether workers see a task's folder at the same place; if not, files go through this process.
 
     Raises:
         AnimatError: if Dask is not installed, or no scheduler answers.
@@ -72,9 +71,7 @@ class Cluster(Executor):
             _expect_listener(address)
             self._client = distributed.Client(address, timeout=_CONNECT_S, set_as_default=False)
         except (OSError, ValueError) as error:
-            raise AnimatError(
-                f"cluster: {where}: no scheduler answers ({first_line(error)}); start it again"
-            ) from error
+            raise AnimatError(f"cluster: {where}: no scheduler answers ({first_line(error)}); start it") from error
         self._refused: set[str] = set()
         self._futures: set[Future[Any]] = set()
         self._has_shared_folder, self._local = has_shared_folder, PinnedProcesses(own_cores()[-1:])

@@ -178,10 +178,7 @@ def store(folder: Path, contents: Mapping[str, bytes]) -> None:
 
 
 def carry_out_unshared(task: Task, reads: Mapping[str, str], folder: Path) -> tuple[TaskResult, dict[str, bytes]]:
-    """`carry_out` in a temporary folder made of files in the worker's `folder` (`store`), their digests by place.
-
-    Returns the contents of the files that the task wrote, too.
-    """
+    """`carry_out` in a temporary folder of files in the worker's `folder` (`store`), with what it wrote."""
     with tempfile.TemporaryDirectory(dir=folder, prefix="animat-task-") as temporary:
         root = Path(temporary)
         for place, digest in reads.items():

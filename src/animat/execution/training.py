@@ -6,9 +6,8 @@ import os
 import shutil
 from collections.abc import Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
-from itertools import product
 from pathlib import Path
 from typing import final
 
@@ -25,20 +24,11 @@ from animat.neurons.timeline import SimulatorTimeline
 from animat.progress import Part, Progress, in_phase
 from animat.robots.host import HostRobot
 from animat.training.course import rows_of
-from animat.training.folder import (
-    MANIFEST,
-    TABLE,
-    describe,
-    expect_trainable,
-    groups_of,
-    is_ours,
-    write_assessments,
-    write_description,
-)
-from animat.training.group import BEST, CHECKPOINT_S, Group, train_groups
+from animat.training.folder import MANIFEST, describe, expect_trainable, finish, groups_of, is_ours, write_description
+from animat.training.group import CHECKPOINT_S, Group, train_groups
 from animat.training.policy import Policy
 from animat.training.specification import CHUNKS, Training
-from animat.writing import clear_away, exclusive_lock
+from animat.writing import exclusive_lock
 
 
 @checked_arguments
@@ -67,11 +57,9 @@ def train(
         folder: folder for the policies, created if missing. None: train in this process and write nothing; if stopped,
             training starts again. This also allows robots and mappings that are not registered.
         workers: processes, each pinned to its own core; None: one per core. Not with an executor.
-        executor: executor for the groups of policies, which must see the folder; it stays open. None: processes on
-            this machine.
+        executor: for the groups of policies; it must see the folder, and stays open. None: processes on this machine.
         checkpoint_s: seconds between checkpoints, which a kill may cost; never changes the result.
-        sources, random_return: for the manifest: names of the recordings, and the mean return of random actions, a line
-            in the live page's learning curves.
+        sources, random_return: names of the recordings and mean return of random actions, for manifest and live page.
         callbacks: called with every row of the learning curves as it is produced; they change no bit.
 
     Returns:
@@ -124,16 +112,7 @@ def train(
                     (folder / MANIFEST).unlink()
                 raise
         shutil.rmtree(folder / UNFINISHED, ignore_errors=True)
-        # In other subfolders another training may be writing.
-        for place, name in product((folder, folder / BEST), ("p*.safetensors", MANIFEST, TABLE)):
-            for leftover in place.glob(f".{name}.*.partial*"):
-                clear_away(leftover)
-        policies = {f"p{i}": Policy.load(folder / f"p{i}.safetensors") for i in range(training.policies)}
-        for name, policy in policies.items():
-            if len(policy.assessments):
-                policies[name] = replace(policy, best=Policy.load(folder / BEST / f"{name}.safetensors"))
-        if training.episodes_assessed and not (folder / TABLE).exists():
-            write_assessments(folder, policies)
+        policies = finish(training, folder)
         curves.finish(policies)
     return policies
 
@@ -182,7 +161,6 @@ def _is_trained(group: Group, folder: Path) -> bool:
 def _train_in_memory(
     groups: Sequence[Group], progress: Progress, callbacks: Sequence[TrainingCallback]
 ) -> dict[str, Policy]:
-    """Train the groups in this process, one after the other."""
     trained: dict[str, Policy] = {}
     curves = Curves(None, groups, callbacks, progress)
     for number, group in enumerate(groups):

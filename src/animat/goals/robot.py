@@ -13,8 +13,7 @@ from jaxtyping import Bool, Float, Int
 
 from animat.arguments import checked_arguments
 from animat.errors import InvalidArgument, shown, within
-from animat.goals.goal import Goal, Objective, is_text, read_goal
-from animat.goals.region import margin_of, region_in_units
+from animat.goals.goal import Goal, Objective, is_text, margin_of, read_goal, region_in_units
 from animat.goals.tally import Margins, Outcome, Tally, add_iteration, empty_tally, outcome
 from animat.lazy import Array, jax, jnp
 from animat.robots.base import WITHOUT, Quantity, Robot, Transition, Uniforms, capability

@@ -21,8 +21,7 @@ class Tally(NamedTuple):
 
     Attributes:
         inside, is_inside: for each objective, the number of iterations in its region; whether the last state is there.
-        margins: for each: to avoid, the smallest distance from the region; to reach, the best margin; for others, the
-            margin of the last state.
+        margins: for each: to avoid, the smallest distance from the region; to reach, the best margin; else the last.
         failed, reached: whether it has ended in this way; nothing after that is counted.
     """
 

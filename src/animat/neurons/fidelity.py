@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from animat.neurons.memory import MemorySimulator
-from animat.neurons.simulator import HistogramSimulator, JointHistogramSimulator, NeuronSimulator
+from animat.neurons.simulator import Histograms, Index, NeuronSimulator, Rates
 from animat.recordings.findings import Finding
 from animat.responses.responses import Responses
 
@@ -25,8 +25,7 @@ class Fidelity:
     """How often each condition passes the pooled median, in the data and in the simulator.
 
     Attributes:
-        in_data: P(x >= P50) of each condition's non-burst responses, shape (conditions,), or (conditions, readouts) for
-            several readouts.
+        in_data: P(x >= P50) of each condition's non-burst responses, shape (conditions,) or (conditions, readouts).
         in_simulator: the same for the simulator, in the same shape.
         n_above_range: non-burst responses, of any readout, above a histogram's range, counted in its last bin.
     """
@@ -43,9 +42,7 @@ class Fidelity:
         return float(np.abs(self.in_data - self.in_simulator).max())
 
     def findings(self, *, of_memory: bool = False) -> tuple[Finding, ...]:
-        """Warnings if binning, or drawing from too few neighbours (of a memory), moves P(x >= P50) by more than
-        `LARGEST_LOSS`, or if responses lie above the range.
-        """
+        """Warnings if P(x >= P50) moves by more than `LARGEST_LOSS`, or responses lie above a histogram's range."""
         found = []
         loss = np.abs(self.in_data - self.in_simulator)
         worst = np.unravel_index(np.argmax(loss), loss.shape)
@@ -76,7 +73,7 @@ def fidelity(responses: Responses, simulator: NeuronSimulator) -> Fidelity:
     conditions = range(len(responses.conditions))
     in_data = np.array([np.mean(read_hz[kept & (responses.condition == c)] >= median_hz, axis=0) for c in conditions])
     above = 0
-    if isinstance(simulator, HistogramSimulator | JointHistogramSimulator):
+    if isinstance(simulator, Histograms):
         above = int(np.count_nonzero(read_hz[kept] > np.asarray(simulator.edges_hz)[..., -1]))
     labels = tuple(condition.label for condition in responses.conditions)
     if isinstance(simulator, MemorySimulator):
@@ -87,13 +84,11 @@ def fidelity(responses: Responses, simulator: NeuronSimulator) -> Fidelity:
 
 
 @jax.jit
-def _shares_after_each(
-    simulator: MemorySimulator, median_hz: Float[Array, "*readouts"]
-) -> Float[Array, "conditions *readouts"]:
+def _shares_after_each(simulator: MemorySimulator, median_hz: Rates) -> Float[Array, "conditions *readouts"]:
     """The share of answers to every condition that reach the median, over the histories of its own responses."""
     rows = jnp.arange(simulator.before.shape[1])
 
-    def of_condition(condition: Int[Array, ""]) -> Float[Array, "*readouts"]:
+    def of_condition(condition: Index) -> Rates:
         above = jnp.asarray(simulator.after_hz)[condition] >= median_hz
         before_each = jnp.concatenate([jnp.zeros((1, *above.shape[1:]), jnp.int32), jnp.cumsum(above, axis=0)])
         trace, load = jnp.asarray(simulator.histories)[condition].T

@@ -33,8 +33,7 @@ class Memory(NamedTuple):
     Attributes:
         decay: of the previous trace; 0: only the last trial is remembered.
         weight: of the stimulus relative to the response; 0: only the response is remembered.
-        neighbour_exponent: of n responses, the n^neighbour_exponent with the nearest histories may be drawn; 1: all of
-            them, whatever the history.
+        neighbour_exponent: of n responses, the n^neighbour_exponent with the nearest histories may be drawn; 1: all.
         load_s: the load's time constant, s; 0: no load.
     """
 
@@ -121,11 +120,8 @@ class Ranked:
             loads.append(kept * left)
             left = loads[-1] + 1
         # The time before the very first trial is infinite.
-        is_finite = np.isfinite(since_s)
-        usual_s = [
-            np.median(since_s[of] if (of := (presented.condition == c) & is_finite).any() else np.inf)
-            for c in range(len(self.rows))
-        ]
+        of_each = [np.isfinite(since_s) & (presented.condition == c) for c in range(len(self.rows))]
+        usual_s = [np.median(since_s[of]) if of.any() else np.inf for of in of_each]
         added = 0.5 / max(float(np.mean(loads)), 1e-9)
         every, after = added * np.array(loads), added * np.array(lefts)[self._place]
         return Loads(every, every[self._place], after, np.exp(-np.array(usual_s) / load_s), added)

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Float64, Int, Int64
 
 from animat.arguments import checked_arguments
 from animat.neurons.history import NO_MEMORY, Memory, Ranked, trace_increment
-from animat.neurons.simulator import Answer, EmpiricalSimulator, Stored, fit_empirical, to_jax
+from animat.neurons.simulator import Answer, EmpiricalSimulator, Index, Rates, Scalar, Stored, fit_empirical, to_jax
 from animat.responses.responses import Responses
 from animat.tables import briefly
 
@@ -44,13 +44,10 @@ class MemorySimulator(EmpiricalSimulator):
     `quantile` always is: the response if nothing is known about the history.
 
     Attributes:
-        before: the position in that order of each of a condition's responses, rising, padded with infinity, shape
-            (conditions, most responses).
+        before: each response's position in that order, rising, infinity as padding, shape (conditions, most responses).
         histories: the history state before them, trace and load (`Answer`), shape (conditions, most responses, 2).
-        after_hz: the responses in that order, shape (conditions, most responses), or (conditions, most responses,
-            readouts) with several readouts.
-        left: what each adds to the trace, (1 - decay) (r + weight m) / (1 + weight), shape (conditions, most
-            responses).
+        after_hz: the responses in that order, shape (conditions, most responses), or with a last axis of readouts.
+        left: what each adds to the trace, (1 - decay) (r + weight m) / (1 + weight), in the shape of `before`.
         followers: the number of these responses, which are those not preceded by a burst, shape (conditions,).
         nearest: k of each condition, shape (conditions,).
         toward: a and b of each condition, shape (conditions, 2).
@@ -58,8 +55,7 @@ class MemorySimulator(EmpiricalSimulator):
         added: c, what a trial adds to the load.
         decay, weight, neighbour_exponent, load_s: as in `Memory`.
 
-    Source: the nearest-neighbour bootstrap of Lall and Sharma 1996 (doi:10.1029/95WR02966), with neighbours in a single
-    number and without its weights.
+    Source: the nearest-neighbour bootstrap of Lall and Sharma 1996 (doi:10.1029/95WR02966), of one number, unweighted.
     """
 
     __repr__ = briefly
@@ -85,14 +81,12 @@ class MemorySimulator(EmpiricalSimulator):
         """The memory of a single recording's simulator, as `fit_memory` takes it."""
         return Memory(float(self.decay), float(self.weight), float(self.neighbour_exponent), float(self.load_s))
 
-    def answer(self, condition: Int[Array, ""], uniform: Float[Array, ""], history: Float[Array, "2"]) -> Answer:
+    def answer(self, condition: Index, uniform: Scalar, history: Float[Array, "2"]) -> Answer:
         load = jnp.asarray(self.kept)[condition] * history[1]
         rate_hz, trace = self.answer_at(condition, uniform, history[0], load)
         return Answer(rate_hz, jnp.stack([trace, load + jnp.asarray(self.added)]))
 
-    def answer_at(
-        self, condition: Int[Array, ""], uniform: Float[Array, ""], trace: Float[Array, ""], load: Float[Array, ""]
-    ) -> tuple[Float[Array, "*readouts"], Float[Array, ""]]:
+    def answer_at(self, condition: Index, uniform: Scalar, trace: Scalar, load: Scalar) -> tuple[Rates, Scalar]:
         """The response for the trace and load at the trial, and the trace after it."""
         first, end = self.rows_near(condition, trace, load)
         # float32 rounds a uniform just under 1 times a count up to the count.
@@ -100,9 +94,7 @@ class MemorySimulator(EmpiricalSimulator):
         trace = jnp.asarray(self.decay) * trace + jnp.asarray(self.left)[condition, row]
         return jnp.asarray(self.after_hz)[condition, row], trace
 
-    def rows_near(
-        self, condition: Int[Array, ""], trace: Float[Array, ""], load: Float[Array, ""]
-    ) -> tuple[Int[Array, ""], Int[Array, ""]]:
+    def rows_near(self, condition: Index, trace: Scalar, load: Scalar) -> tuple[Index, Index]:
         """The first row of `after_hz` to draw from for a trace and a load, and the row after the last."""
         before, count, nearest = self.before[condition], self.followers[condition], self.nearest[condition]
         toward = jnp.asarray(self.toward)[condition]
@@ -173,7 +165,6 @@ def fit_memory(responses: Responses, *, room: int | None = None, memory: Memory 
 
 
 def _find_memory(ranked: Ranked) -> Memory:
-    """The memory that predicts responses best, as described in `fit_memory`."""
     rows = [rows for rows in ranked.rows if len(rows) > 1]
     if not rows:
         return NO_MEMORY
@@ -225,15 +216,13 @@ def _slopes(
 ) -> Float64[np.ndarray, "conditions 2"]:
     """Slopes of each condition's ranks over trace and load, shrunk towards those of all conditions together.
 
-    With some hundred responses, the error of a slope is about as large as the slope. How much the true slopes differ
-    between conditions is estimated from all of them (empirical Bayes), and each is moved towards the common one
-    accordingly.
+    The error of a slope from some hundred responses is about as large as the slope. How much the true slopes differ
+    between conditions is estimated from all of them (empirical Bayes), and each is moved towards the common one.
 
     Source: Morris 1983 (doi:10.1080/01621459.1983.10477920).
     """
-    centred = [
-        (rank - rank.mean(), history - history.mean(axis=0)) for rank, history in zip(ranks, histories, strict=True)
-    ]
+    pairs = zip(ranks, histories, strict=True)
+    centred = [(rank - rank.mean(), history - history.mean(axis=0)) for rank, history in pairs]
     squares = np.array([x.T @ x for _, x in centred])
     products = np.array([x.T @ y for y, x in centred])
     common = np.linalg.lstsq(squares.sum(axis=0), products.sum(axis=0), rcond=None)[0]

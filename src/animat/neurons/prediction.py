@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,13 +13,7 @@ from jaxtyping import Array, Float, Float32, Float64, Int64
 from animat.errors import UnusableData
 from animat.neurons.history import Ranked
 from animat.neurons.memory import MemorySimulator
-from animat.neurons.simulator import (
-    EmpiricalSimulator,
-    HistogramSimulator,
-    JointHistogramSimulator,
-    NeuronSimulator,
-    pooled_percentiles,
-)
+from animat.neurons.simulator import EmpiricalSimulator, Histograms, NeuronSimulator, pooled_percentiles
 from animat.responses.responses import Responses
 
 FEWEST = 20
@@ -135,19 +129,16 @@ class Prediction(NamedTuple):
         return np.asarray((n * (self.probability @ commands) + CLASSES * prior) / (n + CLASSES))
 
 
-def predict_marginal(halves: Halves) -> Prediction:
-    """Predict by the first half's non-burst responses of all conditions together, ignoring the condition."""
-    x_hz = halves.read(halves.first.read_hz)[~halves.first.is_burst].astype(np.float32)
-    share = _shares(x_hz, halves.values_hz)
-    return Prediction(halves, np.tile(share, (len(halves.rows), 1)), np.full(len(halves.rows), float(len(x_hz))))
-
-
-def predict(simulator: NeuronSimulator, halves: Halves) -> Prediction:
-    """Predict each held-out response by a simulator of the first half.
+def predict(simulator: NeuronSimulator | None, halves: Halves) -> Prediction:
+    """Predict each held-out response by a simulator of the first half; None: by the responses to all conditions.
 
     The condition is known and, if the simulator has a memory, everything recorded before. A histogram's draw counts as
     the largest value of the recording that is not above it, so that thresholds give the same commands.
     """
+    if simulator is None:
+        x_hz = halves.read(halves.first.read_hz)[~halves.first.is_burst].astype(np.float32)
+        share = _shares(x_hz, halves.values_hz)
+        return Prediction(halves, np.tile(share, (len(halves.rows), 1)), np.full(len(halves.rows), float(len(x_hz))))
     if isinstance(simulator, MemorySimulator):
         return _predict_with_memory(simulator, halves)
     values_hz = halves.values_hz
@@ -156,7 +147,7 @@ def predict(simulator: NeuronSimulator, halves: Halves) -> Prediction:
         table = halves.read(np.asarray(simulator.values_hz))
         of_condition = [_shares(x[:n], values_hz) for x, n in zip(table, counts, strict=True)]
     else:
-        assert isinstance(simulator, HistogramSimulator | JointHistogramSimulator)
+        assert isinstance(simulator, Histograms)
         counts = np.array([len(halves.first_of(c)) for c in range(simulator.n_conditions)])
         own = ... if halves.readout is None else halves.readout
         cumulatives, edges_hz = np.asarray(simulator.cumulative)[own], np.asarray(simulator.edges_hz)[own]
@@ -178,9 +169,7 @@ def _predict_with_memory(simulator: MemorySimulator, halves: Halves) -> Predicti
 _rows_near = jax.jit(jax.vmap(MemorySimulator.rows_near, (None, 0, 0, 0)))
 
 
-def _shares(
-    x_hz: Float[np.ndarray, " some"], values_hz: Float[np.ndarray, " values"]
-) -> Float64[np.ndarray, " values"]:
+def _shares(x_hz: Float[np.ndarray, " n"], values_hz: Float[np.ndarray, " values"]) -> Float64[np.ndarray, " values"]:
     return np.bincount(np.searchsorted(values_hz, x_hz), minlength=len(values_hz)) / len(x_hz)
 
 
@@ -288,3 +277,10 @@ def shares_lasting(lengths: Int64[np.ndarray, " runs"]) -> Float64[np.ndarray, "
     if not len(lengths):
         return np.full(LAGS, np.nan)
     return np.asarray(np.mean(lengths[:, None] >= np.arange(1, LAGS + 1), axis=0))
+
+
+def in_time(series: Float64[np.ndarray, "n trials"], threshold_hz: float) -> tuple[Any, Any, Any]:
+    """The autocorrelation of each series, the mean length of its runs, and the shares that last."""
+    lengths = [run_lengths(one, threshold_hz) for one in series]
+    means = [runs.mean() if len(runs) else np.nan for runs in lengths]
+    return autocorrelation(series), np.array(means), np.array([shares_lasting(runs) for runs in lengths])

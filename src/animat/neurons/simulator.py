@@ -21,6 +21,9 @@ from animat.tables import briefly
 
 Stored: TypeAlias = Array | np.ndarray[Any, Any]
 """Arrays of a simulator: JAX's, or numpy's while it travels to another process."""
+Scalar: TypeAlias = Float[Array, ""]
+Index: TypeAlias = Int[Array, ""]
+Rates: TypeAlias = Float[Array, "*readouts"]
 LARGEST_BINS = 10_000
 """Most bins of a histogram: a draw compares with each edge, and a recording has some hundred responses."""
 PERCENTILES = tuple(range(0, 101, 10))
@@ -36,7 +39,7 @@ class Answer(NamedTuple):
         history: the history state, trace and load (`animat.neurons.history`), as `animat.neurons.memory` updates it.
     """
 
-    rate_hz: Float[Array, "*readouts"]
+    rate_hz: Rates
     history: Float[Array, "2"]
 
 
@@ -46,8 +49,7 @@ class NeuronSimulator(abc.ABC):
     With several readouts, one draw answers for all of them.
 
     Attributes:
-        percentiles: P0, P10, ..., P100 of the non-burst responses of all conditions together, in Hz, shape (11,), or
-            (readouts, 11) with several readouts.
+        percentiles: P0, P10, ..., P100 of all non-burst responses together, in Hz, shape (11,), or (readouts, 11).
         has_memory: whether its answers depend on the history.
     """
 
@@ -65,13 +67,13 @@ class NeuronSimulator(abc.ABC):
         return 1 if self.percentiles.ndim == 1 else int(self.percentiles.shape[0])
 
     @abc.abstractmethod
-    def quantile(self, condition: Int[Array, ""], uniform: Float[Array, ""]) -> Float[Array, "*readouts"]:
+    def quantile(self, condition: Index, uniform: Scalar) -> Rates:
         """The response x, in Hz per channel, below which the share `uniform` (in [0, 1)) of a condition's lies.
 
         With several readouts, which have no order, any function of a uniform that has their joint distribution.
         """
 
-    def answer(self, condition: Int[Array, ""], uniform: Float[Array, ""], history: Float[Array, "2"]) -> Answer:
+    def answer(self, condition: Index, uniform: Scalar, history: Float[Array, "2"]) -> Answer:
         """The answer to a condition, from a uniform in [0, 1), after a history state (see `Answer`).
 
         A simulator without memory answers the same after any history, and leaves the history unchanged.
@@ -86,8 +88,8 @@ class NeuronSimulator(abc.ABC):
 
     @final
     def sample(
-        self, key: PRNGKeyArray, condition: Int[Array, ""], history: ArrayLike | tuple[float, float] = INITIAL_HISTORY
-    ) -> Float[Array, "*readouts"]:
+        self, key: PRNGKeyArray, condition: Index, history: ArrayLike | tuple[float, float] = INITIAL_HISTORY
+    ) -> Rates:
         """Draw one response x to a condition, in Hz per channel, after a history state (see `Answer`)."""
         uniform = jax.random.uniform(key, dtype=jnp.float32)
         return self.answer(condition, uniform, jnp.asarray(history, jnp.float32)).rate_hz
@@ -116,13 +118,11 @@ class HistogramSimulator(NeuronSimulator):
     def n_conditions(self) -> int:
         return self.cumulative.shape[-2]
 
-    def quantile(self, condition: Int[Array, ""], uniform: Float[Array, ""]) -> Float[Array, ""]:
+    def quantile(self, condition: Index, uniform: Scalar) -> Scalar:
         return _quantile_of(self.cumulative[condition], self.edges_hz, uniform)
 
 
-def _quantile_of(
-    cumulative: Float[Stored, " edges"], edges_hz: Float[Stored, " edges"], uniform: Float[Array, ""]
-) -> Float[Array, ""]:
+def _quantile_of(cumulative: Float[Stored, " edges"], edges_hz: Float[Stored, " edges"], uniform: Scalar) -> Scalar:
     """The quantile of one histogram (see `HistogramSimulator`)."""
     # Twenty comparisons beat a binary search, and an empty bin is never chosen, as its two edges share a value.
     bin_ = jnp.sum(uniform >= cumulative[1:-1])
@@ -166,7 +166,7 @@ class JointHistogramSimulator(NeuronSimulator):
     def n_conditions(self) -> int:
         return self.counts.shape[-1]
 
-    def quantile(self, condition: Int[Array, ""], uniform: Float[Array, ""]) -> Float[Array, " readouts"]:
+    def quantile(self, condition: Index, uniform: Scalar) -> Float[Array, " readouts"]:
         """The responses of all readouts for the trial that a uniform in [0, 1) draws."""
         count = jnp.asarray(self.counts)[condition]
         # float32 rounds a uniform just under 1 times a count up to the count.
@@ -174,6 +174,9 @@ class JointHistogramSimulator(NeuronSimulator):
         shares = (jnp.asarray(self.ranks)[condition, trial] + (uniform * count - trial)) / count
         cumulative, edges_hz = jnp.asarray(self.cumulative)[:, condition], jnp.asarray(self.edges_hz)
         return jax.vmap(_quantile_of)(cumulative, edges_hz, jnp.clip(shares, 0.0, _BELOW_ONE))
+
+
+Histograms: TypeAlias = HistogramSimulator | JointHistogramSimulator
 
 
 @jax.tree_util.register_dataclass
@@ -185,8 +188,7 @@ class EmpiricalSimulator(NeuronSimulator):
     trials are sorted by the response of all channels together.
 
     Attributes:
-        values_hz: each condition's responses, sorted, padded at the end, shape (conditions, most responses), or
-            (conditions, most responses, readouts) with several readouts.
+        values_hz: sorted responses, padded, shape (conditions, most responses), or with a last axis of readouts.
         counts: the number of responses, shape (conditions,).
     """
 
@@ -200,7 +202,7 @@ class EmpiricalSimulator(NeuronSimulator):
     def n_conditions(self) -> int:
         return self.counts.shape[-1]
 
-    def quantile(self, condition: Int[Array, ""], uniform: Float[Array, ""]) -> Float[Array, "*readouts"]:
+    def quantile(self, condition: Index, uniform: Scalar) -> Rates:
         count = self.counts[condition]
         # float32 rounds a uniform just under 1 times a count up to the count.
         row = jnp.minimum((uniform * count).astype(jnp.int32), count - 1)
@@ -226,8 +228,7 @@ def fit_histogram(responses: Responses, *, bins: int = 20, range_hz: float | Non
     Args:
         responses: of one recording, every condition with at least one non-burst response.
         bins: how many (the paper: 20); a multiple of ten keeps all shares that thresholds use.
-        range_hz: equally wide bins from 0 to here instead (the paper: 120). Responses above it are counted in the last
-            bin, and `fidelity` reports their number.
+        range_hz: equally wide bins from 0 to here instead (the paper: 120); responses above it count in the last bin.
 
     Raises:
         InvalidArgument: as `check_binning` does.
@@ -281,8 +282,7 @@ def fit_empirical(responses: Responses, *, room: int | None = None) -> Empirical
 
     Args:
         responses: of one recording, every condition with at least one non-burst response.
-        room: the number of values that each condition has room for, so that simulators of several recordings stack;
-            None: as many as the largest condition needs.
+        room: values that each condition has room for, so that simulators stack; None: as many as the largest needs.
 
     Raises:
         UnusableData: if a condition has no non-burst response.

@@ -69,9 +69,8 @@ class SimulatorTimeline:
         conditions: from which the agent picks, the same in every recording.
         presentation: how stimuli were presented; None if it is not known.
         fidelities: how faithful each simulator is to its responses.
-        fitted: how the simulators were fitted, for later use: `kind`, `bins`, `range_hz`; `by`, the rule of the
-            conditions; `burst_threshold`, if one was given; and `burst_thresholds`, the share of active channels above
-            which a response of each recording was left out.
+        fitted: how they were fitted: `kind`, `bins`, `range_hz`; `by`, the rule of the conditions; `burst_threshold`,
+            if one was given; `burst_thresholds`, the active share above which each recording's responses were left out.
         findings: on the recordings and the fits, each beginning with the minute.
         responses: to which the simulators were fitted; empty if they come from elsewhere.
         readouts: that they answer for, the same in every recording.
@@ -154,8 +153,7 @@ def fit_timeline(
 
     Args:
         series: responses of the recordings, all with the same conditions, window and presentation, in any order.
-        kind: `"histogram"` (the paper), `"empirical"` (draw a measured value) or `"memory"` (draw one measured after a
-            similar history); None: `"memory"`, but `"histogram"` if stimuli were presented in blocks, which do not show
+        kind: as in `Kind`; None: `"memory"`, but `"histogram"` if stimuli were presented in blocks, which do not show
             how a culture responds after a different condition.
         bins, range_hz: of a histogram, the same for all recordings, as in `fit_histogram`.
 

@@ -13,19 +13,7 @@ from animat.arguments import checked_arguments
 from animat.errors import InvalidArgument
 from animat.neurons.history import NO_MEMORY
 from animat.neurons.memory import MemorySimulator
-from animat.neurons.prediction import (
-    CLASSES,
-    Halves,
-    autocorrelation,
-    free_runs,
-    halved,
-    predict,
-    predict_marginal,
-    recorded_series,
-    run_lengths,
-    share_below,
-    shares_lasting,
-)
+from animat.neurons.prediction import CLASSES, Halves, free_runs, halved, in_time, predict, recorded_series, share_below
 from animat.neurons.timeline import Kind, default_kind, fit_simulator
 from animat.responses.responses import Responses
 from animat.tables import briefly
@@ -76,8 +64,7 @@ class Scores:
         crps_hz: continuous ranked probability score of each.
         transforms: the probability integral transform of each, from F(x-) to F(x).
         distance: Kolmogorov's distance of the transforms from uniform.
-        p_value: the probability of such a distance by chance; None for kinds that do not predict equally from all
-            responses to a condition, for which it does not hold.
+        p_value: of such a distance by chance; None for kinds that do not draw evenly from a condition's responses.
         autocorrelation: of the free runs, at lags 1 to `LAGS`.
         run_length: the mean length, in the free runs, of runs at or above P50 of the first half.
         lasting: the share of these that last 1 to `LAGS` trials or more.
@@ -117,8 +104,7 @@ class Validation:
         n_fitted, n_held: non-burst responses to each condition in the first and the second half.
         medians_hz: of these.
         above: P(x >= P50) of the held-out responses to each, P50 that of the first half.
-        autocorrelation, run_length, lasting: of the held-out responses, as in `Scores`; runs at or above their own P50,
-            as the thresholds of a loop adapt.
+        autocorrelation, run_length, lasting: of the held-out responses, as in `Scores`; runs at or above their own P50.
         scores: of the marginal distribution and of each kind.
         kind: the kind that the verdict is about.
         is_blocked: whether conditions were presented in blocks.
@@ -246,7 +232,7 @@ def validate(responses: Responses, *, kind: str | None = None, seed: int = 1, re
     scores = []
     for each in (MARGINAL, *kinds):
         simulator = simulators.get(each)
-        prediction = predict_marginal(halves) if simulator is None else predict(simulator, halves)
+        prediction = predict(simulator, halves)
         # Without memory it is the empirical simulator, than which that one is not coarser.
         remembers = isinstance(simulator, MemorySimulator) and simulator.memory != NO_MEMORY
         prior = probabilities.get("empirical" if remembers else MARGINAL, 1 / CLASSES)
@@ -254,7 +240,7 @@ def validate(responses: Responses, *, kind: str | None = None, seed: int = 1, re
         of_observed = np.take_along_axis(probabilities[each], halves.commands_of(halves.x_hz)[:, None], 1)[:, 0]
         transforms = prediction.transforms()
         distance = distance_from_uniform(transforms)
-        correlation, length, lasting = map(_band, _in_time(free_runs(simulator, prediction, FREE_RUNS, rng), median_hz))
+        correlation, length, lasting = map(_band, in_time(free_runs(simulator, prediction, FREE_RUNS, rng), median_hz))
         passing = prediction.probability @ (halves.values_hz >= median_hz)
         scores.append(
             Scores(
@@ -271,7 +257,7 @@ def validate(responses: Responses, *, kind: str | None = None, seed: int = 1, re
             )
         )
     # At its own median, as a loop's thresholds adapt: drift is reported separately.
-    recorded = _in_time(recorded_series(halves)[None], float(np.median(halves.x_hz)))
+    recorded = in_time(recorded_series(halves)[None], float(np.median(halves.x_hz)))
     recorded_correlation, recorded_length, recorded_lasting = (of_one[0] for of_one in recorded)
     conditions = range(len(responses.conditions))
     first = [halves.first_of(c) for c in conditions]
@@ -353,13 +339,6 @@ def _plain(value: Any) -> Any:
 
 def _by_condition(x: Any, halves: Halves) -> Float64[np.ndarray, " conditions"]:
     return np.array([x[halves.condition == c].mean() for c in range(len(halves.whole.conditions))], np.float64)
-
-
-def _in_time(series: Float64[np.ndarray, "n trials"], threshold_hz: float) -> tuple[Any, Any, Any]:
-    """The autocorrelation of each series, the mean length of its runs, and the shares that last."""
-    lengths = [run_lengths(one, threshold_hz) for one in series]
-    means = [runs.mean() if len(runs) else np.nan for runs in lengths]
-    return autocorrelation(series), np.array(means), np.array([shares_lasting(runs) for runs in lengths])
 
 
 def _band(x: Float64[np.ndarray, "n *some"]) -> Band:

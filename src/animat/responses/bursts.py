@@ -56,8 +56,7 @@ def otsu_threshold(values: Float64[np.ndarray, " values"]) -> float:
     the edges of a histogram. The first of several equally good cuts is taken. If all values are equal there is nothing
     to cut, and the threshold is that value; without values it is NaN.
 
-    Source: Otsu, "A threshold selection method from gray-level histograms", IEEE Trans. SMC 9 (1979), 62-66,
-    doi:10.1109/TSMC.1979.4310076.
+    Source: Otsu 1979, "A threshold selection method from gray-level histograms", doi:10.1109/TSMC.1979.4310076.
     """
     distinct, counts = np.unique(values, return_counts=True)
     if len(distinct) < 2:
@@ -76,12 +75,10 @@ def separate_bursts(
 ) -> BurstSeparation:
     """Set bursts apart from the other responses of a recording, all conditions together.
 
-    Otsu's method splits any numbers in two. Its split is kept if there are two groups of five responses or more: with a
-    valley of at least 0.8 between them, or of 0.5 if they are 8 standard deviations apart. Otherwise no response is a
-    burst.
+    Otsu's method splits any numbers in two. Its split is kept if there are two groups of five responses or more, with a
+    valley of at least 0.8 between them, or of 0.5 if they are 8 standard deviations apart; else there are no bursts.
 
-    `active_ratio` is the share of the `n_channels` with at least one spike in the window. A given `threshold`, from
-    0 to 1, is used in any case; 1 keeps every response.
+    `active_ratio` is the share of the `n_channels` with a spike in the window; a given `threshold` is used in any case.
 
     Source: the paper's burst separation (Otsu's threshold over all ratios of a recording), which always cuts.
     """

@@ -36,8 +36,7 @@ class Condition:
         value: the frequency in Hz; the number of the pattern; else the position in the list; 0 for "all".
         unit: of `value`: `"Hz"`, or empty if the value is only a number.
         frequencies_hz: each trial is at one of them; empty: not known. For a condition in Hz this is its value.
-        electrodes: sets of electrodes, each pulse on one of them; empty: not known; None: any of the culture's
-            patterns; `RESTING`: nothing is delivered.
+        electrodes: sets, each pulse on one of them; empty: not known; None: any of the patterns; `RESTING`: no pulse.
         only_last: only the last pulse of a trial is on these electrodes, and those before are on any pattern.
 
     Raises:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import abc
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -79,8 +78,7 @@ class ByInterval(Conditions):
     frequencies. If two frequencies match, the nearer one in ratio wins.
 
     The previous interval counts, not the next, as a response can depend only on what came before it. The first pulse of
-    a recording has no previous pulse, hence no condition. All pulses count as previous ones, including those of the
-    same trial.
+    a recording has no previous pulse, hence no condition. Pulses of the same trial count as previous ones, too.
 
     Attributes:
         values_hz: the frequencies, in the order of their index.
@@ -205,14 +203,11 @@ def default_conditions(stimuli: Stimuli, protocol: Protocol | None = None) -> Co
 
 
 def conditions_named(text: str) -> Conditions:
-    """Read conditions from their text form.
+    """Read conditions from their text form; InvalidArgument for anything else.
 
     `all`, `frequency`, `frequency:5,10`, `interval:5,10`, `interval:5,10+-25%`, `electrode`,
     `electrode:23275,909+23923`, `pattern`, `pattern:0,3`, and products of frequency or interval with electrode or
     pattern, `frequency:5,80 x pattern:0,3`.
-
-    Raises:
-        InvalidArgument: for anything else.
     """
     expect_kind("conditions", text, str, "text such as 'frequency:5,10'")
     with within("conditions"):
@@ -249,9 +244,7 @@ def _parse(text: str) -> Conditions:
     )
 
 
-def _with_stimuli(
-    stimuli: Stimuli, index: Int64[np.ndarray, " stimuli"], conditions: Sequence[Condition]
-) -> Assignment:
+def _with_stimuli(stimuli: Stimuli, index: Int64[np.ndarray, " stimuli"], conditions: list[Condition]) -> Assignment:
     """An assignment whose conditions also describe their stimuli, unless they already do."""
     last = np.flatnonzero(stimuli.is_last_of_presentation)
     of = index[last]

@@ -18,7 +18,7 @@ from animat.responses.quality.one_culture import series_findings
 from animat.responses.quality.responses import findings_on
 from animat.responses.readouts import ALL, Readouts, readouts_on
 from animat.responses.responses import Responses, Trials
-from animat.responses.windows import DEFAULT_WINDOW_MS, check_window, read_windows
+from animat.responses.windows import DEFAULT_WINDOW_MS, Window, check_window, read_windows
 
 SILENCE_S = 1.0
 """A longer time without a pulse is silence: the slowest of the paper's stimuli are 0.2 s apart."""
@@ -43,7 +43,7 @@ _NOTHING_TO_FIT = ("no-stimuli", "no-condition", "empty-condition")
 def extract_responses(
     source: Recording | ResponseTable,
     by: Conditions | str | None = None,
-    window_ms: tuple[float, float] = DEFAULT_WINDOW_MS,
+    window_ms: Window = DEFAULT_WINDOW_MS,
     burst_threshold: float | None = None,
     readouts: str | Readouts = ALL,
 ) -> Responses:
@@ -60,23 +60,18 @@ def extract_responses(
 
     Args:
         source: spikes, or the response of each channel to each stimulus.
-        by: the rule of the conditions, or its text form (`conditions_named`); None: by frequency if it is known, by
-            place if the protocol has places.
+        by: the conditions, or their text form (`conditions_named`); None: by frequency, or places if there are any.
         window_ms: start and end of the window after the pulse. A table that states its window replaces the default; for
             one that does not, this is the window in which its spikes were counted.
         burst_threshold: a ratio of active channels to use in place of Otsu's threshold; 1 keeps every response.
-        readouts: groups of channels whose x is read too, in the same windows, or `halves` or `quadrants`; bursts are
-            identified from all channels.
+        readouts: groups of channels whose x is read too, or `halves` or `quadrants`; bursts are those of all channels.
 
     Raises:
-        InvalidArgument: for a window that is not a stretch of time after the stimulus, or conditions that cannot be
-            read.
+        InvalidArgument: for a window that does not follow the stimulus, or conditions that cannot be read.
         UnusableData: without channels, or for conditions by interval with a table without times.
-        Mismatch: for channels that do not read all electrodes of the readouts, or a window that differs from the
-            table's.
+        Mismatch: for channels that do not read all electrodes of the readouts, or a window unlike the table's.
 
-    Source: the paper's methods (2-10 ms, x = S_total / (T N), Otsu's threshold on the ratio of active channels, here
-        only where it finds two groups).
+    Source: the paper's methods (2-10 ms, x = S_total / (T N), Otsu's threshold, here only where it finds two groups).
     """
     window_ms = check_window(window_ms)
     stimuli, n_channels = source.stimuli, len(source.channels)
@@ -142,9 +137,7 @@ def extract_responses(
     return replace(responses, findings=(*assumed, *findings_on(responses, source, assignment, bursts, inside)))
 
 
-def _window_of(
-    table: ResponseTable, by: Conditions, window_ms: tuple[float, float]
-) -> tuple[tuple[float, float], tuple[Finding, ...]]:
+def _window_of(table: ResponseTable, by: Conditions, window_ms: Window) -> tuple[Window, tuple[Finding, ...]]:
     """The window in which a table's spikes were counted, and a finding if the table does not state it."""
     if table.window_ms is not None and window_ms not in (DEFAULT_WINDOW_MS, table.window_ms):
         raise Mismatch(
@@ -167,7 +160,7 @@ def _window_of(
 def extract_series(
     recordings: Sequence[Recording | ResponseTable],
     by: Conditions | str | None = None,
-    window_ms: tuple[float, float] | None = None,
+    window_ms: Window | None = None,
     *,
     burst_threshold: float | None = None,
     allow: Sequence[str] = (),
@@ -180,14 +173,11 @@ def extract_series(
         by, burst_threshold: as in `extract_responses`.
         window_ms: start and end of the window after the pulse; None: the paper's, 2 to 10 ms.
         allow: names of findings (`"dead-window"`) to ignore.
-        readouts: groups of channels, the same electrodes in all recordings; `halves` and `quadrants` are those of the
-            first one.
+        readouts: groups of channels, the same electrodes in all; `halves` and `quadrants` are those of the first.
 
     Raises:
-        UnusableData: if a finding refuses a recording, or recordings are of different cultures, unless `allow` names
-            it.
-        InvalidArgument: for conditions that cannot be read, a name in `allow` that is not a refusing finding, or
-            channels that do not form readouts.
+        UnusableData: if a finding refuses a recording, or all of them together, unless `allow` names it.
+        InvalidArgument: for conditions that cannot be read, another name in `allow`, or channels that form no readouts.
         Mismatch: for a recording whose channels do not read all electrodes of the readouts.
     """
     check_allowed(allow)

@@ -19,7 +19,7 @@ from animat.responses.conditions import Conditions
 from animat.responses.extraction import extract_responses
 from animat.responses.psth import ResponseTime, find_response, spontaneous_rate
 from animat.responses.responses import Responses
-from animat.responses.windows import DEFAULT_WINDOW_MS
+from animat.responses.windows import DEFAULT_WINDOW_MS, Window
 from animat.tables import briefly
 
 Verdict = Literal["usable", "usable with care", "not usable"]
@@ -140,7 +140,7 @@ class Inspection:
 def inspect_recording(
     recording: Recording | ResponseTable,
     by: Conditions | str | None = None,
-    window_ms: tuple[float, float] = DEFAULT_WINDOW_MS,
+    window_ms: Window = DEFAULT_WINDOW_MS,
     burst_threshold: float | None = None,
     name: str | None = None,
 ) -> Inspection:
@@ -151,8 +151,7 @@ def inspect_recording(
         name: what to call it; by default the source in its provenance.
 
     Raises:
-        InvalidArgument: for anything but a recording, a window that is not a stretch of time after the stimulus, or
-            conditions that cannot be read.
+        InvalidArgument: for a window that does not follow the stimulus, or conditions that cannot be read.
         UnusableData: for a recording without channels.
         Mismatch: for a window that differs from a table's.
     """
@@ -192,10 +191,7 @@ def inspect_recording(
 
 
 def _gravest_first(source: Recording | ResponseTable, responses: Responses) -> tuple[Finding, ...]:
-    """The findings on the recording and on its responses.
-
-    Of those with the same name, the responses' say more; but on missing stimuli the recording's does.
-    """
+    """Of findings with the same name, the responses' say more than the recording's, except on missing stimuli."""
     found = [finding for finding in responses.findings if finding.name != "no-stimuli"]
     names = {finding.name for finding in found}
     found += [finding for finding in recording_findings(source) if finding.name not in names]

@@ -12,7 +12,7 @@ from pydantic import Field
 from animat.errors import InvalidArgument, Mismatch, in_file, shown, some_of
 from animat.recordings.recording import Channels
 from animat.records import json_data, read_record, record
-from animat.responses.windows import Spiking, spikes_in
+from animat.responses.windows import PerWindow, Spiking, Window, spikes_in
 from animat.stimulation.places import CUT, count_places, electrodes_of, read_groups
 from animat.stimulation.selection import Electrode
 from animat.tables import UNKNOWN
@@ -34,8 +34,7 @@ class Readouts:
 
     Attributes:
         names: of the groups, in the order of the commands.
-        electrodes: of each group, rising; None: one group of all channels, whatever they read. An electrode may be in
-            several groups.
+        electrodes: of each group, rising; groups may overlap. None: one group of all channels, whatever they read.
 
     Raises:
         InvalidArgument: for invalid names or electrodes, or names without electrodes.
@@ -74,9 +73,7 @@ class Readouts:
         read = set(channels.electrode.tolist()) - {UNKNOWN}
         for name, group in zip(self.names, self.electrodes, strict=True):
             if missing := sorted(set(group) - read):
-                known = (
-                    f"{len(read):,} are read ({some_of(sorted(read), 5)})" if read else "which are read is not known"
-                )
+                known = f"{len(read):,} are read ({some_of(sorted(read), 5)})" if read else "none is known"
                 raise Mismatch(
                     f"readouts: expected channels that read all electrodes of the readout {name!r}, got none for "
                     f"{len(missing)} of its {len(group)} ({some_of(missing, 5)}); {known}"
@@ -84,11 +81,7 @@ class Readouts:
         return np.array([np.isin(channels.electrode, group) for group in self.electrodes])
 
     def read(
-        self,
-        recording: Spiking,
-        members: Bool[np.ndarray, "readouts channels"],
-        after_s: Float64[np.ndarray, " windows"],
-        window_ms: tuple[float, float],
+        self, recording: Spiking, members: Bool[np.ndarray, "readouts channels"], after_s: PerWindow, window_ms: Window
     ) -> Float64[np.ndarray, "windows *readouts"]:
         """The response x of each group in a window after each pulse, in Hz per channel.
 
@@ -153,8 +146,7 @@ def readouts_on(readouts: str | Readouts, channels: Channels) -> Readouts:
     """Readouts defined by the electrodes of a recording's channels.
 
     Halves are the electrodes with the smaller and the larger x, split as evenly as possible; for quadrants each half is
-    split by y, as for places (`animat.stimulation.places`). For given groups, channels that do not read all of their
-    electrodes raise Mismatch.
+    split by y, as for places (`animat.stimulation.places`). Raises Mismatch for given groups that are not read whole.
     """
     if readouts == "all":
         return ALL

@@ -62,18 +62,15 @@ class Responses:
         threshold, separability: of the active ratio, see `animat.responses.bursts.BurstSeparation`.
         presentation: how stimuli were presented; None if it is not known.
         start_min: start of the recording on the culture's clock, in minutes.
-        time_s: of the pulse after which each response was read, on the recording's clock, shape (responses,); None if
-            it is not known.
-        presented: all trials of the recording, including those without a condition; None: these responses are all, in
-            close succession (see `presentations`).
+        time_s: of the pulse before each response, on the recording's clock, shape (responses,); None if not known.
+        presented: all trials, including those without a condition; None: these responses are all (see `presentations`).
         place: the index of each response among them, shape (responses,).
         by: the rule that sorted stimuli into conditions, as `conditions_named` reads it; None if it is not known.
         burst_threshold: the given threshold; None: it is Otsu's.
         culture: that was recorded; None if it is not known.
         channels: those over which x is a mean; None if they are not known.
         readouts: the groups of channels read; by default all channels as one.
-        readout_hz: x of each readout, shape (responses, readouts), or (responses,) for one; None for all channels as
-            one, whose x is `rate_hz`.
+        readout_hz: x of each readout, shape (responses, readouts), or (responses,) for one; None: it is `rate_hz`.
 
     Raises:
         Mismatch: for columns of different lengths, or a condition that is not in the list.

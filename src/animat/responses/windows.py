@@ -5,18 +5,22 @@ from __future__ import annotations
 import math
 from collections.abc import Sized
 from numbers import Real
-from typing import Protocol
+from typing import Protocol, TypeAlias
 
 import numpy as np
 from jaxtyping import Float64, Int64
 
 from animat.errors import InvalidArgument, expect_several, shown
 
+Window: TypeAlias = tuple[float, float]
+"""Start and end after a stimulus, in milliseconds."""
 DEFAULT_WINDOW_MS = (2.0, 10.0)
 """The paper's window: the first 2 ms after a stimulus are lost in its artefact."""
 HALF_NS_S = 0.5e-9
 """Histograms of lags begin each bin this much earlier, as if lags were rounded to a nanosecond: otherwise rounding
 errors would decide about lags on an edge, which are common with times on a sampling grid."""
+
+PerWindow: TypeAlias = Float64[np.ndarray, " windows"]
 
 
 class Spiking(Protocol):
@@ -30,9 +34,7 @@ class Spiking(Protocol):
     def channels(self) -> Sized: ...
 
 
-def read_windows(
-    recording: Spiking, after_s: Float64[np.ndarray, " windows"], window_ms: tuple[float, float]
-) -> tuple[Float64[np.ndarray, " windows"], Float64[np.ndarray, " windows"]]:
+def read_windows(recording: Spiking, after_s: PerWindow, window_ms: Window) -> tuple[PerWindow, PerWindow]:
     """The response in a window after each pulse: its rate x and its ratio of active channels.
 
         x = S / (T N)
@@ -52,7 +54,7 @@ def read_windows(
     return rate_hz, active / n_channels
 
 
-def check_window(window_ms: tuple[float, float]) -> tuple[float, float]:
+def check_window(window_ms: Window) -> Window:
     """The window, as a tuple; raises InvalidArgument unless it is a stretch of time after the stimulus."""
     words = "two numbers of milliseconds, start and end"
     several = expect_several("window_ms", window_ms, Real, words)
@@ -66,9 +68,7 @@ def check_window(window_ms: tuple[float, float]) -> tuple[float, float]:
     return start_ms, end_ms
 
 
-def count_spikes(
-    recording: Spiking, from_s: Float64[np.ndarray, " windows"], to_s: Float64[np.ndarray, " windows"]
-) -> Int64[np.ndarray, " windows"]:
+def count_spikes(recording: Spiking, from_s: PerWindow, to_s: PerWindow) -> Int64[np.ndarray, " windows"]:
     """The number of spikes with from_s <= time < to_s, on all channels together.
 
     Windows are half-open, so that adjacent windows share no spike. Times are compared in double precision. Those on a
@@ -79,7 +79,7 @@ def count_spikes(
 
 
 def spikes_in(
-    recording: Spiking, from_s: Float64[np.ndarray, " windows"], to_s: Float64[np.ndarray, " windows"]
+    recording: Spiking, from_s: PerWindow, to_s: PerWindow
 ) -> tuple[Int64[np.ndarray, " pairs"], Int64[np.ndarray, " pairs"]]:
     """All pairs of a window and a spike in it, as rows of both; edges and arguments as in `count_spikes`."""
     first, counts = _first_and_count(recording, from_s, to_s)
@@ -89,7 +89,7 @@ def spikes_in(
 
 
 def _first_and_count(
-    recording: Spiking, from_s: Float64[np.ndarray, " windows"], to_s: Float64[np.ndarray, " windows"]
+    recording: Spiking, from_s: PerWindow, to_s: PerWindow
 ) -> tuple[Int64[np.ndarray, " windows"], Int64[np.ndarray, " windows"]]:
     """The index of the first spike of each window, and the number of spikes; edges as in `count_spikes`."""
     first = recording.spike_times_s.searchsorted(from_s)

@@ -67,8 +67,7 @@ class TwoLinkArm(Robot[ArmState]):
         target_radius_m: R.
 
     Raises:
-        InvalidArgument: for a parameter that is not finite or makes no sense, links too different in length to reach
-            a target, or a step too long for the equations.
+        InvalidArgument: for links too different in length to reach a target, or a step too long for the equations.
 
     Source: any robotics textbook, the manipulator with two revolute joints; the task is that of Gymnasium's
     `Reacher-v5`, and of the drawing arm Meart (Bakkum et al. 2007).
@@ -101,8 +100,7 @@ class TwoLinkArm(Robot[ArmState]):
                 f"step_s: expected at most {STIFFEST * SUBSTEPS * least / self.damping_n_m_s:.3g} for links so light "
                 f"and joints so damped, got {self.step_s:g}"
             )
-        # At the speed at which damping balances full torque, or, if that is less, that of the elbow alone at the end of
-        # an episode.
+        # At the speed at which damping balances full torque, or, if less, that of the elbow alone at an episode's end.
         torque_n_m, elbow_kg_m2 = max(self.torque_n_m, 1e-9), self._inertia[2]
         damped_s = TURN_RAD * SUBSTEPS * self.damping_n_m_s / torque_n_m
         longest_s = max(damped_s, math.sqrt(TURN_RAD * SUBSTEPS * elbow_kg_m2 / (torque_n_m * self.episode_limit)))

@@ -26,13 +26,9 @@ Transition: TypeAlias = tuple[State, "Float[Array, '']", "Bool[Array, '']"]
 LONGEST_EPISODE = 1_000_000
 """Most iterations of an episode: each has its own random key, drawn before the first."""
 
-
-def _to_whole(value: Any) -> Any:
-    # The command line and files have 120.0 for 120.
-    return int(value) if isinstance(value, float) and value.is_integer() else value
-
-
-Iterations = Annotated[Whole, Field(ge=1, le=LONGEST_EPISODE), BeforeValidator(_to_whole)]
+# The command line and files have 120.0 for 120.
+_TO_WHOLE = BeforeValidator(lambda value: int(value) if isinstance(value, float) and value.is_integer() else value)
+Iterations = Annotated[Whole, Field(ge=1, le=LONGEST_EPISODE), _TO_WHOLE]
 Size = Annotated[Number, Field(ge=1e-9, le=1e9)]
 Amount = Annotated[Number, Field(ge=0, le=1e9)]
 """Types of a robot's parameters: a size is never 0."""
@@ -56,12 +52,10 @@ class Quantity:
         unit: such as `m`.
         scale: its usual size, in that unit; a learner divides by it.
         low, high: bounds in that unit that no observation of an episode exceeds, including the last.
-        of_goal: whether it describes the goal rather than the body and its surroundings; a reflex does not know it
-            (`animat.evaluation.coupling`).
+        of_goal: whether it describes the goal, not the body; a reflex does not know it (`animat.evaluation.coupling`).
 
     Raises:
-        InvalidArgument: for a name or a unit that is not a string, for a scale or a bound that is not a number, and for
-            bounds that do not rise.
+        InvalidArgument: for a name or unit that is not a string, a scale or bound that is no number, or falling bounds.
     """
 
     name: str
@@ -87,9 +81,9 @@ class Quantity:
 class Robot(abc.ABC, Generic[State]):
     """A body with a task, driven by one or several motor commands u in [-1, 1] per iteration.
 
-    Implementations are frozen dataclasses whose fields are all parameters, with units in their names. They compare,
-    hash (so they are static under `jax.jit`) and convert to JSON. JAX is imported only when a robot first moves:
-    robots can be named, compared and stored without it.
+    Implementations are frozen dataclasses whose fields are all parameters, with units in their names; ours raise
+    InvalidArgument for one that is not finite or makes no sense. They compare, hash (so they are static under
+    `jax.jit`) and convert to JSON, without JAX, which is imported only when a robot first moves.
 
     `terminated` means that the task ended (fell, arrived). Reaching `episode_limit` is truncation: the program that
     runs the episode counts iterations, the robot never does.
@@ -185,11 +179,8 @@ WITHOUT = {
 
 def lacking(robot: Robot[Any]) -> dict[str, str]:
     """What is left out for this robot: a sentence for each missing method, by the method's name."""
-    return {
-        name: f"{without}: {robot.name} has no method `{name}`"
-        for name, without in WITHOUT.items()
-        if not hasattr(robot, name)
-    }
+    missing = {name: without for name, without in WITHOUT.items() if not hasattr(robot, name)}
+    return {name: f"{without}: {robot.name} has no method `{name}`" for name, without in missing.items()}
 
 
 def capability(robot: Robot[Any], name: str) -> Callable[..., Any]:

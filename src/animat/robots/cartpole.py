@@ -51,9 +51,6 @@ class Cartpole(Robot[CartpoleState]):
         angle_limit_rad: the episode fails if the pole leans further, to either side.
         reward_failed: the reward of the iteration that fails, in place of `reward_upright`.
 
-    Raises:
-        InvalidArgument: for a parameter that is not finite or makes no sense.
-
     Source: Sawada et al. 2022, the cartpole task and its table of constants.
     """
 
@@ -122,9 +119,8 @@ class Cartpole(Robot[CartpoleState]):
             angle + self.step_s * angular_velocity,
             angular_velocity + self.step_s * angular_acceleration,
         )
-        terminated = (jnp.abs(after.position_m) > self.track_length_m / 2) | (
-            jnp.abs(after.angle_rad) > self.angle_limit_rad
-        )
+        is_off_track = jnp.abs(after.position_m) > self.track_length_m / 2
+        terminated = is_off_track | (jnp.abs(after.angle_rad) > self.angle_limit_rad)
         reward = jnp.where(terminated, self.reward_failed, self.reward_upright).astype(position.dtype)
         return after, reward, terminated
 

@@ -62,9 +62,7 @@ def _check_compiled(robot: Robot[Any]) -> None:
     def episode(key: Any) -> Any:
         first = state = _call(f"{name}.reset", robot.reset, key)
         if any(jnp.issubdtype(jnp.result_type(leaf), jax.dtypes.prng_key) for leaf in jax.tree.leaves(state)):
-            raise InvalidArgument(
-                f"{name}.reset: expected a state of numbers, got a key: store jax.random.key_data(key)"
-            )
+            raise InvalidArgument(f"{name}.reset: expected a state of numbers, got a key: store jax.random.key_data")
         outputs, commands = [outputs_of(state, 0.0)], []
         # Commands at both ends and in the middle.
         for number, u in enumerate(np.linspace(-1.0, 1.0, _STEPS, dtype=np.float32), 1):
@@ -185,9 +183,7 @@ def _expect_shape(what: str, value: Any, shape: tuple[int, ...], expected: str, 
         raise InvalidArgument(f"{what}: expected {expected}, shape {shape}, got {shown(value)}") from error
     if array.shape != shape:
         raise InvalidArgument(f"{what}: expected {expected}, shape {shape}, got shape {array.shape}")
-    if jnp.iscomplexobj(array):
-        raise InvalidArgument(f"{what}: expected {expected}, got {array.dtype}")
-    if dtype is bool and array.dtype != bool:
+    if jnp.iscomplexobj(array) or (dtype is bool and array.dtype != bool):
         raise InvalidArgument(f"{what}: expected {expected}, got {array.dtype}")
 
 

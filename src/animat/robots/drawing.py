@@ -32,7 +32,7 @@ _FINER = 4
 WIDEST = 4.0
 """Most times that a picture is wider than it is tall: a long track would fill the memory."""
 
-DONE, FAILED, AIM, EDGE = "#0072B2", "#D55E00", "#009E73", "#8C8C8C"
+ENDED, AIM, EDGE = {True: "#0072B2", False: "#D55E00"}, "#009E73", "#8C8C8C"
 """Colours in figures of paths (Okabe-Ito): episodes that ended well or not, where they should end, and limits."""
 
 
@@ -87,7 +87,7 @@ def draw_over_time(
     """Draw one number of each episode over time, coloured by how the episode ended, well (`success`) or not."""
     for course, is_good in zip(values, ended_well, strict=True):
         time_s = np.arange(len(course)) * robot.step_s
-        axes.plot(time_s, course, color=DONE if is_good else FAILED, linewidth=0.7, alpha=0.8)
+        axes.plot(time_s, course, color=ENDED[is_good], linewidth=0.7, alpha=0.8)
     for limit in limits:
         axes.axhline(limit, color=EDGE, linewidth=0.8, linestyle="--")
     axes.set_xlim(0, robot.episode_limit * robot.step_s)

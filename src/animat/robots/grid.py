@@ -84,8 +84,7 @@ class Grid:
             None: a command can decide whether an episode ends, and every level is computed separately.
         end_is_known: whether a state alone decides if the next iteration ends the task; states beyond the ends of
             the axes are then never treated as those just inside.
-        noise_in_command: the robot's noise as the largest change of the command, either way, uniformly distributed;
-            None: its noise has another form.
+        noise_in_command: the robot's noise as the largest uniform change of the command either way; None: another form.
     """
 
     along: Axis

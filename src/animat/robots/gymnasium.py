@@ -290,8 +290,7 @@ def _observed(name: str, space: Any) -> list[float]:
 def measured_scales(robot: HostRobot, bounds: Sequence[float]) -> tuple[float, ...]:
     """The scale of each observed number: its bound, or, where that is 0 (not known), its root mean square.
 
-    The root mean square is over random commands. It has two digits, so that it does not depend on how a processor
-    rounds, and is 1 for a number that is always 0.
+    That is over random commands, and 1 for a number that is always 0. It has two digits: processors round differently.
     """
     if all(bounds):
         return tuple(map(float, bounds))

@@ -46,8 +46,7 @@ class HostRobot(Robot[Any]):
     Compiled code (the policy, the neurons, learning) sees only the last observation of a body, which serves as its
     state. Functions that need whole episodes in one compiled program refuse such a robot.
 
-    If `keeps_state`, the seed and the commands of an episode determine it: training then continues within it by
-    replaying the commands so far.
+    If `keeps_state`, an episode's seed and commands determine it, and training continues within it by replaying them.
     """
 
     @property

@@ -14,21 +14,7 @@ from animat.errors import InvalidArgument
 from animat.lazy import Array, Axes, jnp
 from animat.records import Number, record
 from animat.robots.base import Amount, Iterations, Quantity, Robot, Size, Transition, Uniforms
-from animat.robots.drawing import (
-    ACCENT,
-    AIM,
-    BODY,
-    DONE,
-    EDGE,
-    FAILED,
-    GOAL,
-    GOAL_FILL,
-    INK,
-    TRAIL,
-    Canvas,
-    Picture,
-    fit,
-)
+from animat.robots.drawing import ACCENT, AIM, BODY, EDGE, ENDED, GOAL, GOAL_FILL, INK, TRAIL, Canvas, Picture, fit
 from animat.robots.grid import Axis, Grid
 from animat.robots.motion import cost_of_distance, within_half_a_turn
 from animat.robots.registry import register_robot
@@ -51,15 +37,14 @@ class Navigation(Robot[NavigationState]):
         heading += turn_rad u,    position += stride_m (cos heading, sin heading), clipped to the arena
         reward   = reward_goal if d <= R (and the episode ends), else R / d - 1
 
-    with d the distance to the goal after the move and R the goal's radius. An episode starts in the top-left corner,
-    facing right.
+    with d the distance to the goal after the move and R its radius. An episode starts at the top left, facing right.
 
     Attributes:
         turn_rad: turn per iteration at u = 1.
         goal_x_m, goal_y_m: from the top-left corner, to the right and down.
 
     Raises:
-        InvalidArgument: for a parameter that is not finite or makes no sense, or a goal outside the arena.
+        InvalidArgument: for a goal outside the arena.
 
     Source: Sawada et al. 2022, the navigation task.
     """
@@ -208,14 +193,13 @@ class Navigation(Robot[NavigationState]):
         """The robot's path in each episode, seen from above."""
         from matplotlib.patches import Circle, Rectangle
 
-        axes.add_patch(
-            Rectangle((0, 0), self.arena_width_m, self.arena_height_m, fill=False, color=EDGE, linewidth=0.8)
-        )
+        arena = Rectangle((0, 0), self.arena_width_m, self.arena_height_m, fill=False, color=EDGE, linewidth=0.8)
+        axes.add_patch(arena)
         goal = (self.goal_x_m, self.goal_y_m)
         axes.add_patch(Circle(goal, self.goal_radius_m, color=AIM, alpha=0.35, linewidth=0))
         arrived = [math.hypot(*(path[-1, :2] - goal)) <= self.goal_radius_m for path in paths]
         for path, has_arrived in zip(paths, arrived, strict=True):
-            axes.plot(path[:, 0], path[:, 1], color=DONE if has_arrived else FAILED, linewidth=0.7, alpha=0.8)
+            axes.plot(path[:, 0], path[:, 1], color=ENDED[has_arrived], linewidth=0.7, alpha=0.8)
         axes.set_aspect("equal")
         axes.set_xlim(-0.03, self.arena_width_m + 0.03)
         axes.set_ylim(self.arena_height_m + 0.03, -0.03)

@@ -21,11 +21,8 @@ robot_named, robot_to_dict, robot_from_dict = REGISTRY.named, REGISTRY.to_dict, 
 def register_robot(kind: Kind) -> Kind:
     """Class decorator that registers a robot by its name, so that its policies can be saved and loaded.
 
-    Args:
-        kind: a frozen dataclass of all parameters, with the methods of `Robot`.
-
-    Raises:
-        InvalidArgument: for any other class, a missing method, or a name that another robot has.
+    Raises InvalidArgument for anything but a frozen dataclass of all parameters with the methods of `Robot`, or if
+    another robot has its name.
     """
     REGISTRY.register(kind)
     return kind

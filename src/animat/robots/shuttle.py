@@ -49,11 +49,9 @@ class Shuttle(Robot[ShuttleState]):
         time_constant_s: of its approach to that speed.
 
     Raises:
-        InvalidArgument: for a parameter that is not finite or makes no sense, places that overlap, or places that
-            are not on the track.
+        InvalidArgument: for places that overlap, or are not on the track.
 
-    Source: the two-way shuttle box, in which an animal crosses to the other side on a cue (Warner 1932,
-    Journal of Genetic Psychology 41:57-90).
+    Source: the two-way shuttle box, crossed on a cue (Warner 1932, Journal of Genetic Psychology 41:57-90).
     """
 
     track_length_m: Size = 1.0

@@ -49,8 +49,7 @@ class SwingUp(Robot[SwingUpState]):
         reward_upright: the reward of an iteration that ends there.
 
     Raises:
-        InvalidArgument: for a parameter that is not finite or makes no sense, or a step in which the rod could make
-            a whole turn.
+        InvalidArgument: for a step in which the rod could make a whole turn.
 
     Source: the pendulum of Gymnasium (`Pendulum-v1`) with another reward.
     """
@@ -72,10 +71,8 @@ class SwingUp(Robot[SwingUpState]):
 
     def __post_init__(self) -> None:
         most_rad = self.step_s * (self.speed_limit_rad_per_s + self.step_s * (self._gravity_per_s2 + self._push_per_s2))
-        if most_rad > 2 * math.pi:
-            raise InvalidArgument(
-                f"step_s: expected a step of less than a turn, got {most_rad / 2 / math.pi:.3g} turns"
-            )
+        if most_rad > math.tau:
+            raise InvalidArgument(f"step_s: expected a step of less than a turn, got {most_rad / math.tau:.3g} turns")
 
     @property
     def return_range(self) -> tuple[float, float]:

@@ -57,8 +57,7 @@ class Wheels(Robot[WheelsState]):
     would touch a wall or an obstacle at the end of an iteration, it turns but stays where it is. d is the distance from
     its centre to the goal and R the goal's radius. A sensor points straight away from the centre and measures the
     distance from the edge of the body to the first thing it meets. An episode starts at `start_x_m`, `start_y_m` with
-    a random heading. Its goal is drawn from the places that the robot can reach from there with some space around it,
-    excluding where it already is.
+    a random heading. Its goal is drawn from the other places that the robot can reach with some space around it.
 
     Attributes:
         max_speed_m_per_s: of a wheel at u = 1.
@@ -69,8 +68,8 @@ class Wheels(Robot[WheelsState]):
         reward_bump: of an iteration in which it could not move.
 
     Raises:
-        InvalidArgument: for a parameter that is not finite or makes no sense, a start without room or without goals
-            within reach, walls that do not close, or a step so long that the robot could pass through a wall.
+        InvalidArgument: for a start without room or without goals within reach, walls that do not close, or a step so
+            long that the robot could pass through a wall.
 
     Source: Mondada et al. 2009, the e-puck (body, wheels and sensors, which here measure distance).
     """

@@ -96,19 +96,13 @@ def programs_with_ranges(
     def varied(ranges: Ranges) -> Varied[Any]:
         return Varied(environment, varying, ranges)
 
-    def beginning(ranges: Ranges, key: Any) -> Learner:
-        return begin(EpisodeLimit(varied(ranges)), algorithm, key)
-
-    def chunk(ranges: Ranges, learner: Learner, simulator: Neurons, first: Any, last: Any) -> Any:
-        return train_chunk(EpisodeLimit(varied(ranges)), algorithm, learner, simulator, first, last)
-
-    def assessment(ranges: Ranges, actor: Network, simulator: Neurons, key: Any) -> Any:
-        return assess(varied(ranges), episodes, actor, simulator, key)
+    def chunk(ranges: Ranges, *arguments: Any) -> Any:
+        return train_chunk(EpisodeLimit(varied(ranges)), algorithm, *arguments)
 
     return (
-        jit_side_by_side(beginning),
+        jit_side_by_side(lambda ranges, key: begin(EpisodeLimit(varied(ranges)), algorithm, key)),
         jit_side_by_side(chunk, (0, 0, None, None, None), donate_argnums=1),
-        jit_side_by_side(assessment, (0, 0, None, None)),
+        jit_side_by_side(lambda ranges, *arguments: assess(varied(ranges), episodes, *arguments), (0, 0, None, None)),
     )
 
 

@@ -52,10 +52,7 @@ def nothing_held(environments: int, n_drawn: int) -> Exploration:
 
 
 def explore(
-    environment: Environment[Any],
-    exploration: Exploration,
-    action: Array,
-    uniforms: Float[Array, "environments uniforms"],
+    environment: Environment[Any], exploration: Exploration, action: Array, uniforms: Float[Array, "environments draws"]
 ) -> tuple[Array, Exploration]:
     """The actions to take: the policy's own, or a held one.
 

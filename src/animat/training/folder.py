@@ -7,6 +7,7 @@ import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -25,12 +26,12 @@ from animat.robots.checking import check_robot
 from animat.robots.host import HostRobot
 from animat.robots.registry import REGISTRY as ROBOTS
 from animat.training.course import ASSESSED
-from animat.training.group import Group, split_groups
+from animat.training.group import BEST, Group, split_groups
 from animat.training.policy import Policy
 from animat.training.settings import LEARNER
 from animat.training.specification import CHUNKS, Training
 from animat.training.varied import expect_varied, varying_in
-from animat.writing import write_whole
+from animat.writing import clear_away, write_whole
 
 MANIFEST = "training.json"
 TABLE = "assessments.csv"
@@ -125,9 +126,8 @@ def expect_folder_for(training: Training, folder: Path) -> None:
 
 def is_finished(training: Training, folder: Path) -> bool:
     """Whether a training's folder holds all of its policies."""
-    return (folder / MANIFEST).exists() and all(
-        (folder / f"p{i}.safetensors").exists() for i in range(training.policies)
-    )
+    names = (MANIFEST, *(f"p{i}.safetensors" for i in range(training.policies)))
+    return all((folder / name).exists() for name in names)
 
 
 def write_description(folder: Path, manifest: dict[str, Any]) -> Path:
@@ -135,7 +135,22 @@ def write_description(folder: Path, manifest: dict[str, Any]) -> Path:
     return write_whole(folder / MANIFEST, json.dumps(manifest, indent=2, sort_keys=True) + "\n")
 
 
-def write_assessments(folder: Path, policies: Mapping[str, Policy]) -> Path:
+def finish(training: Training, folder: Path) -> dict[str, Policy]:
+    """Clear away what a kill left, and write what is missing once all policies are written; returns them by name."""
+    # In other subfolders another training may be writing.
+    for place, name in product((folder, folder / BEST), ("p*.safetensors", MANIFEST, TABLE)):
+        for leftover in place.glob(f".{name}.*.partial*"):
+            clear_away(leftover)
+    policies = {f"p{i}": Policy.load(folder / f"p{i}.safetensors") for i in range(training.policies)}
+    for name, policy in policies.items():
+        if len(policy.assessments):
+            policies[name] = replace(policy, best=Policy.load(folder / BEST / f"{name}.safetensors"))
+    if training.episodes_assessed and not (folder / TABLE).exists():
+        _write_assessments(folder, policies)
+    return policies
+
+
+def _write_assessments(folder: Path, policies: Mapping[str, Policy]) -> None:
     """Write the table of all assessments, with each policy's best one marked."""
     rows = ["policy," + ",".join(ASSESSED) + ",best"]
     for name, policy in policies.items():
@@ -144,7 +159,7 @@ def write_assessments(folder: Path, policies: Mapping[str, Policy]) -> Path:
             numbers = (minute, lesson, success, mean_return)
             cells = ("" if math.isnan(number) else f"{number:.6g}" for number in numbers)
             rows.append(",".join([name, f"{iterations:.0f}", *cells, str(int(row == best))]))
-    return write_whole(folder / TABLE, "\n".join(rows) + "\n")
+    write_whole(folder / TABLE, "\n".join(rows) + "\n")
 
 
 def is_ours(folder: Path, manifest: dict[str, Any]) -> bool:
@@ -180,7 +195,5 @@ def groups_of(
     training.environment_on(timeline)
     if timeline is not None:
         timeline = replace(timeline, simulators=jax.device_get(timeline.simulators))
-    return [
-        Group(training, members, timeline, manifest["fingerprint"], provenance_of(manifest))
-        for members in split_groups(training.policies, fewest=fewest)
-    ]
+    parts = split_groups(training.policies, fewest=fewest)
+    return [Group(training, members, timeline, manifest["fingerprint"], provenance_of(manifest)) for members in parts]

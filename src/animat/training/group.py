@@ -65,8 +65,7 @@ def train_groups(
 ) -> list[list[Policy]]:
     """Train groups of policies at once, resuming from their checkpoint if there is one; returns the policies of each.
 
-    The result is the same, bit for bit, however often the training was stopped and started again. How many are trained
-    at once changes the last bits.
+    However often it was stopped, the result is the same to the bit; how many are trained at once changes the last bits.
 
     Args:
         groups: that one program can train (`animat.execution.gpu.group_by_program`).
@@ -150,13 +149,11 @@ def programs(
 class SideBySide:
     """The policies of groups of one program during training, chunk by chunk, with the simulators passed in.
 
-    If the groups belong to several trainings, none has lessons or is stepped outside JAX. Of their timelines only what
-    all simulators share is used.
+    Groups of several trainings have no lessons and no host robots; of their timelines, only what all share is used.
 
     Args:
         own_programs: `begin` and `train_chunk` for all of them, instead of `programs`.
-        is_diagnosed: whether they are diagnosed after each chunk and must be finite. If not, the learning curves have
-            NaN instead of the diagnosis.
+        is_diagnosed: whether they are diagnosed after each chunk, and must be finite; if not, curves have NaN there.
     """
 
     def __init__(
@@ -277,9 +274,8 @@ class SideBySide:
         if checkpoints[1:]:
             n = len(self._places) // len(checkpoints)
             like = jax.eval_shape(lambda: jax.tree.map(lambda leaf: leaf[:n], like))
-        (done, (learners, course_state), curve), *others = (
-            _read_checkpoint(path, self.fingerprint, like) for path in checkpoints
-        )
+        read = [_read_checkpoint(path, self.fingerprint, like) for path in checkpoints]
+        (done, (learners, course_state), curve), *others = read
         if others:
             learners = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), learners, *(each[1][0] for each in others))
             curve = np.concatenate([curve, *(each[2] for each in others)], axis=1)
@@ -307,12 +303,10 @@ def _read_checkpoint(path: Path, fingerprint: str, like: Any) -> tuple[int, Any,
         # Opened here, as numpy does not close a file that it cannot read.
         with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
             # Checked before anything is read: an archive of some kilobytes can unpack to any size.
-            unpacked = sum(member.file_size for member in file.zip.infolist())
+            size = sum(member.file_size for member in file.zip.infolist())
             most = 2 * sum(leaf.size * leaf.dtype.itemsize for leaf in leaves) + 2**22
-            if unpacked > most:
-                raise InvalidFile(
-                    f"{path}: expected a checkpoint of at most {most:,} bytes, got {unpacked:,}; remove it"
-                )
+            if size > most:
+                raise InvalidFile(f"{path}: expected a checkpoint of at most {most:,} bytes, got {size:,}; remove it")
             if str(file["fingerprint"]) != fingerprint:
                 raise InvalidFile(f"{path}: expected a checkpoint of this training, got another training's; remove it")
             arrays = [file[f"leaf{i}"] for i in range(sum(name.startswith("leaf") for name in file.files))]

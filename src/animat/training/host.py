@@ -52,8 +52,7 @@ def learn_and_act(
 ) -> tuple[Learner, Actions, Finished]:
     """Store a round, learn from the replay, and act in the next round.
 
-    The round is its actions, and what the bodies did: their steps (`animat.robots.host.StepResult`), and what is
-    observed once ended episodes have restarted.
+    `moved` is what the bodies did: their `StepResult`, and what is observed once ended episodes have restarted.
     """
     acting, learning = uniform_shapes(environment, settings)
     n_acting = math.prod(acting)
@@ -125,16 +124,14 @@ class OnHost:
         none = Snapshot.initial(self._robot, len(keys) * self._n)
         return learners._replace(episodes=learners.episodes._replace(robot=self._by_policy(none)))
 
-    def train(
-        self, learners: Learner, simulator: Neurons, first_round: Array, last_round: Array
-    ) -> tuple[Learner, Finished]:
+    def train(self, learners: Learner, simulator: Neurons, first: Array, last: Array) -> tuple[Learner, Finished]:
         members = len(learners.returns)
         finished = Finished(np.zeros(members), np.zeros(members))  # type: ignore[arg-type]
-        if int(last_round) == int(first_round):
+        if int(last) == int(first):
             return learners, finished
         learners, bodies = self._restore(learners)
         learners, acted = self._act(learners, simulator)
-        for index in range(int(first_round), int(last_round)):
+        for index in range(int(first), int(last)):
             commands = np.asarray(acted.command).reshape(len(self._seeds), -1)
             stepped = bodies.step(commands)
             ended = np.flatnonzero(stepped.ended)

@@ -43,8 +43,7 @@ class Lesson:
 
     Attributes:
         starts: ranges of numbers of the robot's state at the start of an episode, by name.
-        recordings_min: minutes of the culture's clock, inclusive, between which the recordings started from which an
-            episode's simulator is drawn, if it is (`Training.shadowing`); None: all.
+        recordings_min: an episode draws one of the recordings that started between these minutes; None: one of all.
         success: the share of an assessment's episodes that must succeed for the policy to move on.
         until_return: alternatively, the mean return that they must reach, in the task's units.
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +22,8 @@ class Layer(NamedTuple):
 
 
 Network = tuple[Layer, ...]
+Observations: TypeAlias = Float[Array, "batch observations"]
+Commands: TypeAlias = Float[Array, "batch commands"]
 
 
 def initial_networks(key: PRNGKeyArray, *shapes: tuple[tuple[int, ...], tuple[int, ...]]) -> list[Network]:
@@ -53,8 +55,8 @@ def forward(network: Network, inputs: Float[Array, "*_ batch inputs"]) -> Float[
 
 
 def squashed_normal(
-    outputs: Float[Array, "batch means_and_deviations"], uniforms: Float[Array, "batch commands"]
-) -> tuple[Float[Array, "batch commands"], Float[Array, " batch"]]:
+    outputs: Float[Array, "batch means_and_deviations"], uniforms: Commands
+) -> tuple[Commands, Float[Array, " batch"]]:
     """A continuous action a = tanh(z) and log p(a), where the z of its commands are independent normal numbers.
 
     The first half of the actor's outputs are their means, the second half their log standard deviations.
@@ -70,10 +72,7 @@ def squashed_normal(
 
 
 def draw_action(
-    environment: Environment[Any],
-    actor: Network,
-    observation: Float[Array, "batch observations"],
-    uniforms: Float[Array, "batch drawn"],
+    environment: Environment[Any], actor: Network, observation: Observations, uniforms: Float[Array, "batch drawn"]
 ) -> Array:
     """Draw an action from the policy for each scaled observation, by inverse transform sampling."""
     outputs = forward(actor, observation)
@@ -83,9 +82,7 @@ def draw_action(
     return jnp.sum(uniforms >= below, axis=-1)
 
 
-def likeliest_action(
-    environment: Environment[Any], actor: Network, observation: Float[Array, "batch observations"]
-) -> Array:
+def likeliest_action(environment: Environment[Any], actor: Network, observation: Observations) -> Array:
     """The most probable action for each scaled observation; for continuous commands tanh of the mean."""
     outputs = forward(actor, observation)
     if environment.n_actions is not None:
@@ -93,8 +90,6 @@ def likeliest_action(
     return as_commands(environment, jnp.tanh(outputs[:, : environment.n_drawn]))
 
 
-def as_commands(
-    environment: Environment[Any], actions: Float[Array, "batch commands"]
-) -> Float[Array, "batch *commands"]:
+def as_commands(environment: Environment[Any], actions: Commands) -> Float[Array, "batch *commands"]:
     """Continuous actions as the robot takes them: a single command is a number."""
     return actions[:, 0] if environment.robot.n_commands == 1 else actions

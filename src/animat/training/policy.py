@@ -10,7 +10,7 @@ from collections.abc import Mapping as Dict
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeAlias
 
 import numpy as np
 from jaxtyping import Float, Float32, Float64
@@ -33,8 +33,7 @@ from animat.robots.base import LARGEST_SCALE, LEAST_SCALE, Robot
 from animat.robots.registry import REGISTRY as ROBOTS
 from animat.stimulation.protocol import Presentation
 from animat.tables import briefly
-from animat.training.provenance import expect_provenance
-from animat.training.settings import PulseCost
+from animat.training.settings import PulseCost, expect_provenance
 from animat.writing import write_whole
 
 FORMAT = "animat-policy-1"
@@ -50,6 +49,8 @@ _LARGEST = 1e6
 """Trained weights are of order one; with weights larger than this the outputs overflow."""
 
 Command = Annotated[Number, Field(ge=-1, le=1)]
+Action: TypeAlias = int | float | Float[np.ndarray, " commands"]
+"""The index of a condition (or command), or a continuous command."""
 
 FITTED = ("kind", "bins", "range_hz", "by", "burst_threshold")
 """The entries of `SimulatorTimeline.fitted` that determine a recording's simulator."""
@@ -141,9 +142,7 @@ class Policy:
                 raise InvalidArgument(f"{name}: expected float32, got {', '.join(kinds)}")
             # Also false for NaN.
             if name != "scales" and not all(np.all(np.abs(array) <= _LARGEST) for array in arrays):
-                raise InvalidArgument(
-                    f"{name}: expected finite numbers up to {_LARGEST:g}, got NaN, infinite or larger ones"
-                )
+                raise InvalidArgument(f"{name}: expected finite numbers up to {_LARGEST:g}, got NaN or larger ones")
         if not np.all((self.scales >= LEAST_SCALE) & (self.scales <= LARGEST_SCALE)):
             raise InvalidArgument(
                 f"scales: expected numbers from {LEAST_SCALE:g} to {LARGEST_SCALE:g}, got {self.scales.tolist()}"
@@ -220,23 +219,15 @@ class Policy:
         exponentials = np.exp(logits - logits.max())
         return exponentials / exponentials.sum()  # type: ignore[no-any-return]
 
-    def act(
-        self, observation: Float[np.ndarray, " observations"], rng: np.random.Generator
-    ) -> int | float | Float[np.ndarray, " commands"]:
-        """Draw an action from the policy: the index of a condition (or command), or a continuous command.
-
-        Args:
-            observation: in physical units, shape (observations,).
-        """
+    def act(self, observation: Float[np.ndarray, " observations"], rng: np.random.Generator) -> Action:
+        """Draw an action for an observation in physical units."""
         if self.n_actions is None:
             mean, log_std = np.split(self.outputs(observation).astype(np.float64), 2)
             return _squash(mean + np.exp(np.clip(log_std, -5.0, 2.0)) * rng.standard_normal(len(mean)))
         below = np.cumsum(self.probabilities(observation))
         return min(int(np.searchsorted(below, rng.random() * below[-1], side="right")), len(below) - 1)
 
-    def act_greedily(
-        self, observation: Float[np.ndarray, " observations"]
-    ) -> int | float | Float[np.ndarray, " commands"]:
+    def act_greedily(self, observation: Float[np.ndarray, " observations"]) -> Action:
         """The most probable action; for continuous commands tanh of the mean."""
         outputs = self.outputs(observation)
         if self.n_actions is not None:
@@ -246,9 +237,8 @@ class Policy:
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the policy as safetensors, with everything that is not an array as JSON in its metadata.
 
-        Raises:
-            InvalidFile: if it cannot be written; an existing file is left unchanged.
-            InvalidArgument: for a robot or a mapping that is not registered, as the file could not be loaded.
+        Raises InvalidFile if it cannot be written, which leaves an existing file unchanged, and InvalidArgument for a
+        robot or a mapping that is not registered, as the file could not be loaded.
         """
         from safetensors.numpy import save
 
@@ -284,9 +274,8 @@ class Policy:
     def load(path: str | os.PathLike[str]) -> Policy:
         """Read a policy that `save` wrote.
 
-        Raises:
-            InvalidFile: if the file is missing, damaged, or not a policy in this format; or if its robot or mapping is
-                not registered here, with what to import.
+        Raises InvalidFile if it is missing, damaged, or not a policy in this format; or, with what to import, if its
+        robot or mapping is not registered here.
         """
         path = expect_plain_file(path, _MOST_BYTES)
         arrays, description = _read(path)
@@ -362,8 +351,7 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray[Any, Any]], dict[str, Any]]:
 def first_of_alike(policies: Dict[str, Policy], attributes: Sequence[str], advice: str) -> Policy:
     """The first of several policies, which represents all of them.
 
-    `attributes` include their conditions. Raises Mismatch if one differs, or the stimuli of a condition do, and
-    InvalidArgument for anything but policies by name.
+    `attributes` include their conditions. Raises Mismatch if one differs, or stimuli do; InvalidArgument for none.
     """
     if not policies:
         raise InvalidArgument("policies: expected at least one, got none")
@@ -381,8 +369,7 @@ def first_of_alike(policies: Dict[str, Policy], attributes: Sequence[str], advic
 def load_policies(path: str | os.PathLike[str]) -> dict[str, Policy]:
     """Read one policy file, or all in a folder, by name, in the order of their numbers (p2 before p10).
 
-    Raises:
-        InvalidFile: if there is none, or one cannot be read.
+    Raises InvalidFile if there is none, or one cannot be read.
     """
     path = Path(path)
     if not is_folder(path):

@@ -3,21 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from animat.environment import Environment
+from animat.neurons.simulator import Index
 from animat.training.settings import SAC
+
+PerEnvironment: TypeAlias = Float[Array, " environments"]
+Flags: TypeAlias = Bool[Array, " environments"]
+States: TypeAlias = Float[Array, "environments state"]
+Rows: TypeAlias = Float[Array, "environments row"]
 
 
 class Batch(NamedTuple):
     """A batch of transitions; observations and rewards are scaled, actions and `ended` are floats.
 
-    The last number of a state is the time left, from 1 at the start of an episode to -1 at its limit; the actor sees
-    only the other numbers, `observation`.
+    A state ends with the time left, from 1 at the start of an episode to -1 at its limit, which the actor does not see.
     """
 
     state: Float[Array, "batch state"]
@@ -36,13 +41,8 @@ class Batch(NamedTuple):
 
 
 def pack_transitions(
-    settings: SAC,
-    state: Float[Array, "environments state"],
-    next_state: Float[Array, "environments state"],
-    action: Array,
-    reward: Float[Array, " environments"],
-    ended: Bool[Array, " environments"],
-) -> Float[Array, "environments row"]:
+    settings: SAC, state: States, next_state: States, action: Array, reward: PerEnvironment, ended: Flags
+) -> Rows:
     """Rows of the replay, from which `draw_batch` unpacks a `Batch`."""
     of_action = action.reshape(len(state), -1).astype(jnp.float32)
     row = jnp.stack([settings.reward_scale * reward, ended], axis=1, dtype=jnp.float32)
@@ -51,9 +51,7 @@ def pack_transitions(
 
 @jax.custom_batching.custom_vmap
 def remember(
-    replay: Float[Array, "*policies transitions row"],
-    rows: Float[Array, "*policies environments row"],
-    at: Int[Array, ""],
+    replay: Float[Array, "*policies transitions row"], rows: Float[Array, "*policies environments row"], at: Index
 ) -> Float[Array, "*policies transitions row"]:
     """Write rows into a replay from row `at` on, which is the same for all policies that are trained side by side.
 
@@ -70,10 +68,7 @@ def _remember_each(size: int, is_batched: Sequence[bool], *arguments: Array) -> 
 
 
 def draw_batch(
-    environment: Environment[Any],
-    replay: Float[Array, "transitions row"],
-    available: Int[Array, ""],
-    uniforms: Float[Array, " batch"],
+    environment: Environment[Any], replay: Float[Array, "n row"], available: Index, uniforms: Float[Array, " batch"]
 ) -> Batch:
     """Draw transitions from the first `available` ones of a replay."""
     n, n_drawn = len(environment.observation_spec) + 1, environment.n_drawn

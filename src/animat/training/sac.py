@@ -24,14 +24,15 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from animat.compilation import jit_side_by_side
 from animat.environment import Environment, Neurons, State
+from animat.neurons.simulator import Index
 from animat.robots.base import Robot
 from animat.training.exploration import Exploration, count_ended, entropy_factor, explore, n_uniforms, nothing_held
 from animat.training.networks import Network, draw_action, forward, initial_networks, squashed_normal
-from animat.training.replay import Batch, draw_batch, pack_transitions, remember
+from animat.training.replay import Batch, Flags, PerEnvironment, Rows, States, draw_batch, pack_transitions, remember
 from animat.training.settings import SAC
 from animat.wrappers import EpisodeLimit, net_return, net_reward
 
@@ -56,7 +57,7 @@ class Learner(NamedTuple):
     optimiser: Any
     replay: Float[Array, "transitions row"]
     episodes: State
-    returns: Float[Array, " environments"]
+    returns: PerEnvironment
     exploration: Exploration
     key: PRNGKeyArray
 
@@ -64,8 +65,7 @@ class Learner(NamedTuple):
 class Finished(NamedTuple):
     """The number of the policy's episodes that ended in a chunk, and the sum of their returns, in the task's units.
 
-    The costs of trials (`animat.wrappers.TrialCosts`) are not subtracted. Episodes in which actions were held
-    (`animat.training.exploration`) are excluded.
+    Costs of trials (`TrialCosts`) are not subtracted; episodes in which actions were held (`Exploration`) are excluded.
     """
 
     episodes: Float[Array, ""]
@@ -164,22 +164,16 @@ def begin(environment: EpisodeLimit[Any], settings: SAC, key: PRNGKeyArray) -> L
 
 
 def train_chunk(
-    environment: EpisodeLimit[Any],
-    settings: SAC,
-    learner: Learner,
-    simulator: Neurons,
-    first_round: Int[Array, ""],
-    last_round: Int[Array, ""],
+    environment: EpisodeLimit[Any], settings: SAC, learner: Learner, simulator: Neurons, first: Index, last: Index
 ) -> tuple[Learner, Finished]:
     """Act and learn for some rounds with one simulator; in a round every environment does one iteration.
 
-    Environment and settings are static. The rounds are those from the first up to but excluding the last, the same for
-    all policies that are trained side by side.
+    Environment and settings are static. The last round is excluded; policies trained side by side have the same rounds.
     """
     acting, learning = uniform_shapes(environment, settings)
     n_acting = math.prod(acting)
 
-    def one_round(index: Int[Array, ""], carry: tuple[Learner, Finished]) -> tuple[Learner, Finished]:
+    def one_round(index: Index, carry: tuple[Learner, Finished]) -> tuple[Learner, Finished]:
         learner, finished = carry
         key, use, reset_key = jax.random.split(learner.key, 3)
         uniforms = jax.random.uniform(use, (n_acting + math.prod(learning),))
@@ -199,7 +193,7 @@ def train_chunk(
         return learner, jax.tree.map(jnp.add, finished, of_round)
 
     nothing = Finished(jnp.float32(0.0), jnp.float32(0.0))
-    trained: tuple[Learner, Finished] = jax.lax.fori_loop(first_round, last_round, one_round, (learner, nothing))
+    trained: tuple[Learner, Finished] = jax.lax.fori_loop(first, last, one_round, (learner, nothing))
     return trained
 
 
@@ -211,13 +205,8 @@ def uniform_shapes(environment: Environment[Any], settings: SAC) -> tuple[tuple[
 
 
 def shaped(
-    robot: Robot[Any],
-    settings: SAC,
-    before: Any,
-    after: Any,
-    reward: Float[Array, " environments"],
-    ended: Bool[Array, " environments"],
-) -> Float[Array, " environments"]:
+    robot: Robot[Any], settings: SAC, before: Any, after: Any, reward: PerEnvironment, ended: Flags
+) -> PerEnvironment:
     """Shaped rewards for learning, if the robot has a `potential`; they leave the optimal policy unchanged.
 
         r + gamma (1 - d) potential(s') - potential(s)
@@ -246,20 +235,14 @@ def choose_actions(
     return learner._replace(exploration=exploration), action, uniforms[:, n_before:]
 
 
-def critic_state(environment: Environment[Any], episodes: State) -> Float[Array, "environments state"]:
+def critic_state(environment: Environment[Any], episodes: State) -> States:
     """The critics' inputs: scaled observations, and the time left."""
     left = 1.0 - 2.0 * episodes.iteration[:, None] / environment.robot.episode_limit
     return jnp.concatenate([jax.vmap(environment.observe)(episodes) / environment.scales, left], axis=1)
 
 
 def end_round(
-    settings: SAC,
-    learner: Learner,
-    index: Int[Array, ""],
-    rows: Float[Array, "environments row"],
-    after: State,
-    ended: Bool[Array, " environments"],
-    episodes: State,
+    settings: SAC, learner: Learner, index: Index, rows: Rows, after: State, ended: Flags, episodes: State
 ) -> tuple[Learner, Finished]:
     """Store a round's transitions (`rows`), and count the episodes that ended in it; all go on from `episodes`."""
     returns = learner.returns + after.reward
@@ -277,15 +260,14 @@ def learn(
     environment: Environment[Any],
     settings: SAC,
     learner: Learner,
-    index: Int[Array, ""],
+    index: Index,
     uniforms: Float[Array, "gradient_steps blocks batch"],
 ) -> Learner:
     """Take `settings.gradient_steps` gradient steps after round `index`, and average the deployed actor.
 
     Polynomial-decay averaging (Shamir and Zhang 2013, arXiv:1212.1824), whose window grows with the training: the
     quality of the last actor depends on luck in its last few updates; that of the average does not. With k the
-    averaging exponent and t the rounds done: average += (k + 1) / (t + k) (actor - average); the first actor is taken
-    whole.
+    averaging exponent and t the rounds done: average += (k + 1) / (t + k) (actor - average).
     """
     adam = _adam(settings)
     n_drawn, is_continuous = environment.n_drawn, environment.n_actions is None
@@ -307,9 +289,8 @@ def learn(
         targets = jax.tree.map(lambda t, c: t + settings.tau * (c - t), targets, trained.critics)
         return (trained, targets, optimiser), None
 
-    (trained, targets, optimiser), _ = jax.lax.scan(
-        update, (learner.trained, learner.targets, learner.optimiser), uniforms
-    )
+    before = learner.trained, learner.targets, learner.optimiser
+    (trained, targets, optimiser), _ = jax.lax.scan(update, before, uniforms)
     rate = (settings.averaging_exponent + 1.0) / (index + 1.0 + settings.averaging_exponent)
     deployed = jax.tree.map(lambda average, new: average + rate * (new - average), learner.deployed, trained.actor)
     return learner._replace(trained=trained, deployed=deployed, targets=targets, optimiser=optimiser)
@@ -334,7 +315,7 @@ class Diagnosis(NamedTuple):
     critic_loss: Float[Array, ""]
 
 
-def diagnose(environment: Environment[Any], settings: SAC, learner: Learner, available: Int[Array, ""]) -> Diagnosis:
+def diagnose(environment: Environment[Any], settings: SAC, learner: Learner, available: Index) -> Diagnosis:
     """Diagnose a learner, always with the same random numbers; NaN if its replay has no transitions available."""
     n_drawn = environment.n_drawn
     uniforms = jax.random.uniform(jax.random.key(0), (1 + 2 * n_drawn, _TRANSITIONS))

@@ -1,13 +1,15 @@
-"""The settings of the training algorithm, and the limits of a training. JAX is not imported here."""
+"""What describes a training, without JAX: the algorithm's settings, limits, and what code reads of a provenance."""
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any, Literal
 
 from pydantic import Field
+from typing_extensions import TypedDict
 
 from animat.errors import InvalidArgument
-from animat.records import Number, Positive, Share, Whole, record
+from animat.recordings.recorded_culture import RecordedCulture
+from animat.records import Flag, Number, Positive, Share, Whole, read_record, record
 
 LEARNER = 2
 """Revision of the learner, raised with every change that changes trained policies. 2: exploration."""
@@ -15,6 +17,7 @@ MOST_POLICIES = 1_000
 Policies = Annotated[Whole, Field(ge=1, le=MOST_POLICIES)]
 PulseCost = Annotated[Number, Field(ge=0, le=1e6)]
 """Cost of an electrode pulse, in the units of the reward."""
+Count = Annotated[Whole, Field(ge=1, le=10**9)]
 FORMER = {
     "updates": "gradient_steps",
     "follow": "tau",
@@ -39,8 +42,7 @@ class SAC:
         discount: gamma.
         tau: fraction by which the target critics move towards the critics at each gradient step.
         reward_scale: factor applied to rewards inside the learner only.
-        averaging_exponent: exponent of polynomial-decay averaging; the deployed actor is an average over about the last
-            1 / (averaging_exponent + 1) of its training so far.
+        averaging_exponent: of polynomial-decay averaging, over about the last 1 / (averaging_exponent + 1) of training.
         initial_alpha: weight of the entropy bonus at the start.
         target_entropy_ratio: target entropy of discrete actions, as a share of the largest possible, log(actions).
         entropy_nats: target entropy of a continuous action, per command.
@@ -70,3 +72,40 @@ class SAC:
             raise InvalidArgument(
                 f"replay: expected a multiple of environments ({self.environments}), got {self.replay}"
             )
+
+
+class TrainingProvenance(TypedDict, total=False):
+    """How the policy was trained; missing entries are unknown."""
+
+    shadowing: Flag | Literal["drawn"]
+    duration_min: Positive | None
+    chunks: Count
+    percentiles: Literal["moving", "first"]
+    delivery: Literal["chosen", "shuffled"]
+
+
+class SimulatorProvenance(TypedDict, total=False):
+    """The simulators it was trained on; missing entries are unknown."""
+
+    kind: Literal["histogram", "empirical", "memory"]
+    bins: Count | None
+    range_hz: Positive | None
+    by: str | None
+    burst_threshold: Share | None
+    recorded_at_min: list[Number]
+
+
+class Provenance(TypedDict, total=False):
+    """The entries of a policy's provenance that code reads; the others are for people, and kept unchanged."""
+
+    training: TrainingProvenance | None
+    simulators: SimulatorProvenance | None
+    culture: RecordedCulture | None
+
+
+def expect_provenance(provenance: Any) -> None:
+    """Refuse a provenance with an invalid entry among those that are read."""
+    trained = read_record(Provenance, provenance, "provenance").get("training") or {}
+    # `Policy.trained_until_min` needs both.
+    if trained.get("duration_min") is not None and "chunks" not in trained:
+        raise InvalidArgument("provenance.training: expected chunks with duration_min, got none")

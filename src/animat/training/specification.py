@@ -80,27 +80,23 @@ class Training:
 
     Attributes:
         robot: the robot, or its name; with or without a goal (`animat.goals.robot.with_goal`).
-        mapping: from responses to commands, or its name; None trains the baseline without neurons, which moves the
-            robot directly.
+        mapping: from responses to commands, or its name; None: the baseline without neurons.
         policies: number of policies, each with its own random numbers.
         iterations: iterations of the robot per policy; rounded up to whole rounds of `algorithm.environments`.
         seed: decides every random draw.
         shadowing: whether simulators are refreshed during training; if not, the first one is used throughout.
             `"drawn"`: each episode draws one of those that refreshing would have used (`animat.training.lessons`).
-        duration_min: minutes of the culture's clock that the whole training represents (the paper: 60); None: as long
-            as the recordings that it is trained on (`SimulatorTimeline.span_min`).
+        duration_min: minutes of the culture's clock it represents (the paper: 60); None: `SimulatorTimeline.span_min`.
         percentiles: `"moving"` with the simulator in use, or fixed by the `"first"` recording.
         delivery: `"shuffled"` trains the paper's control, whose condition is drawn at random regardless of its choice.
         neural_observation: whether policies also see the neurons' history state (`animat.wrappers.NeuralObservation`).
             A closed loop computes it from the culture's responses; a live run refuses such policies.
         commands: without neurons, the commands to choose from; None: any in [-1, 1], as many as the robot takes.
         algorithm: settings of Soft Actor-Critic.
-        lessons: lessons in turn, each with ranges from which episodes are drawn; a last one with a threshold is
-            followed by the task itself.
+        lessons: in turn, each with ranges for its episodes; after a last one with a threshold comes the task itself.
         pulse_cost: cost of an electrode pulse, in the units of the reward: policies are trained on the rewards minus
             the costs of their trials (`animat.coding.encoder`). Reported returns do not include the cost.
-        assess: episodes of the assessment at the end of each chunk, by which the best policy so far is kept; None:
-            no assessments, except that lessons with a threshold use 20.
+        assess: episodes of each chunk's assessment, which keeps the best policy; None: none, but 20 for thresholds.
 
     Raises:
         InvalidArgument: for counts or durations that are not positive.

@@ -23,7 +23,7 @@ from starlette.websockets import WebSocket
 
 from animat.errors import AnimatError, InvalidArgument, first_line
 from animat.watch.discovery import find, place_within
-from animat.watch.plain import text
+from animat.watch.files import text
 from animat.watch.recording import RecordingView
 from animat.watch.session import SessionView, stop_session
 from animat.watch.study import CulturesView, StudyView
@@ -32,7 +32,6 @@ from animat.watch.tuning import TuningView
 from animat.watch.view import View
 
 _MOST_VIEWS = 8
-"""Most views kept open."""
 _VIEWS: dict[str, type[View]] = {
     view.kind: view for view in (SessionView, TrainingView, StudyView, CulturesView, TuningView, RecordingView)
 }
@@ -51,7 +50,6 @@ _HEADERS = {
     "cross-origin-resource-policy": "same-origin",
     "cache-control": "no-store",
 }
-"""Headers of every response."""
 
 
 class Watched:
@@ -155,8 +153,7 @@ def _guard(token: str, port: int) -> Callable[[Request, RequestResponseEndpoint]
     """Middleware that answers 403 to any request that is not from the page or its address, and passes on the rest.
 
     A foreign name that resolves to this machine (DNS rebinding) appears in `Host`, a foreign page in `Origin`. Neither
-    knows the token that begins every path. The time of the last request that was passed on is kept in
-    the application's `state.asked_s`.
+    knows the token that begins every path. When the last request was passed on is the application's `state.asked_s`.
     """
     hosts = {f"{name}:{port}" for name in ("127.0.0.1", "localhost")}
     origins = {f"http://{host}" for host in hosts}

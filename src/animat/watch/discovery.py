@@ -86,11 +86,8 @@ def recordings_in(folder: Path) -> dict[Path, float]:
         if (folder / LOG_FILE).exists():
             return {}
         files = [*sorted(folder.glob("[!.]*.nwb"))[:_MOST_RECORDINGS], folder / UNDER_WAY]
-        return {
-            file: time_s
-            for file in files
-            if file.is_file() and not file.is_symlink() and (time_s := changed_s(file)) is not None
-        }
+        times_s = {file: changed_s(file) for file in files if file.is_file() and not file.is_symlink()}
+        return {file: time_s for file, time_s in times_s.items() if time_s is not None}
     except OSError:
         return {}
 

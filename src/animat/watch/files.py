@@ -1,26 +1,82 @@
-"""Small files of a run that may be in progress: read whole, or treated as missing."""
+"""What a page may show of a run in progress: small files, read whole or treated as missing, and values made safe.
+
+Numbers are finite, texts of limited length, and spikes packed.
+"""
 
 from __future__ import annotations
 
+import base64
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float, Int
 
 from animat.errors import InvalidFile
 from animat.execution.task import NOTICES, UNFINISHED
 from animat.plain_file import expect_plain_file, read_plain_text
-from animat.training.policy import CURVE, whole_curve
-from animat.watch.plain import listed, mapped, number, text
 
 _MOST_BYTES = 2**24
-_MOST_CURVE_BYTES = 2**22
-_MOST_EPISODES_BYTES = 2**27
+_MOST_SPIKES = 60_000
 
 JobProgress = dict[str, tuple[float, str]]
 """The share done of each job, and a message."""
+
+
+def number(value: Any) -> float | None:
+    """A finite number; None for anything else."""
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    # A whole number in a file can be larger than any float.
+    return value if is_number and abs(value) <= sys.float_info.max else None
+
+
+def numbers(values: Any) -> list[float | None]:
+    """The items of a list as numbers; a number as a list of one; an empty list for None."""
+    if isinstance(values, list):
+        return [number(item) for item in values[:64]]
+    return [] if number(values) is None else [number(values)]
+
+
+def text(value: Any, most: int = 300) -> str:
+    """A value as text that a page can show, truncated if it is long."""
+    string = value if isinstance(value, str) else json.dumps(value, default=str)
+    # Halves of surrogate pairs cannot be sent.
+    string = string[: most + 1].encode("utf-8", "replace").decode("utf-8")
+    return string if len(string) <= most else string[: most - 1] + "…"
+
+
+def listed(value: Any) -> list[Any]:
+    """A list; empty for anything else."""
+    return value if isinstance(value, list) else []
+
+
+def mapped(value: Any) -> dict[str, Any]:
+    """A dictionary; empty for anything else."""
+    return value if isinstance(value, dict) else {}
+
+
+def packed(
+    times_s: Float[np.ndarray, " spikes"], channels: Int[np.ndarray, " spikes"], from_s: float, to_s: float, n: int
+) -> tuple[dict[str, Any], list[int]]:
+    """The spikes of a span on n channels, and their number on each.
+
+    Times, from 0 (the span's start) to 65,535 (its end), and channels, of which larger ones are not drawn, are uint16.
+    """
+    with np.errstate(invalid="ignore"):
+        within = (times_s >= from_s) & (times_s <= to_s) & (channels >= 0) & (channels < n)
+    times_s, channels = times_s[within], channels[within]
+    every = max(1, -(-len(times_s) // _MOST_SPIKES))
+    drawn = np.flatnonzero(channels < 2**16)[::every]
+    ticks = np.rint((times_s[drawn] - from_s) / max(to_s - from_s, 1e-9) * 65535).astype("<u2")
+    spikes = {
+        "n": len(times_s),
+        "every": every,
+        "times": base64.b64encode(ticks.tobytes()).decode(),
+        "channels": base64.b64encode(channels[drawn].astype("<u2").tobytes()).decode(),
+    }
+    return spikes, np.bincount(channels, minlength=n).tolist()
 
 
 def json_of(path: Path) -> dict[str, Any]:
@@ -58,46 +114,7 @@ def job_progress(folder: Path) -> JobProgress:
     return progress
 
 
-def curves_of_checkpoint(path: Path) -> dict[int, Float64[np.ndarray, "chunks columns"]]:
-    """The learning curves in a checkpoint, by policy number; empty if it cannot be read."""
-    arrays = _arrays_in(path, ("curve", "members"), _MOST_CURVE_BYTES)
-    if arrays is None or (curve := _complete(arrays[0], 3)) is None:
-        return {}
-    if arrays[1].dtype.kind not in "iu" or arrays[1].shape != curve.shape[1:2]:
-        return {}
-    return {int(member): curve[:, row] for row, member in enumerate(arrays[1].tolist())}
-
-
-def curve_of_policy(path: Path) -> Float64[np.ndarray, "chunks columns"] | None:
-    """The learning curve in a policy's file; None if it cannot be read."""
-    from safetensors import SafetensorError, safe_open
-
-    try:
-        with safe_open(expect_own(path), framework="numpy") as file:
-            return _complete(file.get_tensor("learning_curve"), 2)
-    except (InvalidFile, OSError, SafetensorError, ValueError, TypeError):
-        return None
-
-
-def _complete(curve: np.ndarray, dimensions: int) -> Float64[np.ndarray, "*_ columns"] | None:
-    """Learning curves with the columns of `CURVE`; None for anything else."""
-    whole = whole_curve(curve)
-    is_curve = whole.ndim == dimensions and whole.shape[-1] == len(CURVE) and whole.dtype.kind == "f"
-    return np.asarray(whole, np.float64) if is_curve else None
-
-
-def mean_of_episodes(path: Path) -> tuple[float, int, int] | None:
-    """Mean return, number of policies and number of episodes of an arm of a study; None if it has no own episodes."""
-    arrays = _arrays_in(path, ("return", "actor", "over_time", "agent", "at_min"), _MOST_EPISODES_BYTES)
-    if arrays is None:
-        raise InvalidFile(f"{path}: expected the episodes of an arm")
-    returns, actors, over_time, agents, at_min = arrays
-    # Episodes over time are few per recording, and a comparison's episodes may be on another recording.
-    own = ~over_time.astype(bool) & (agents == "policy") & (at_min == at_min.max(initial=-np.inf))
-    return (float(returns[own].mean()), len(np.unique(actors[own])), int(own.sum())) if own.any() else None
-
-
-def _arrays_in(path: Path, names: tuple[str, ...], most_bytes: int) -> list[np.ndarray] | None:
+def arrays_in(path: Path, names: tuple[str, ...], most_bytes: int) -> list[np.ndarray] | None:
     """Arrays of a numpy archive; None if it cannot be read or they are too large."""
     try:
         with np.load(expect_own(path), allow_pickle=False) as file:

@@ -15,7 +15,7 @@ from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
 from animat.responses.inspection import Inspection, inspect_recording
 from animat.watch.discovery import is_locked, recordings_in
-from animat.watch.plain import packed, text
+from animat.watch.files import packed, text
 from animat.watch.view import View, chart, curve, facts, in_blocks, table
 
 _Content = tuple[Recording | None, Inspection | None, str]

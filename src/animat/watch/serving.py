@@ -81,8 +81,7 @@ def _end_after(parent: int, app: Any, server: Any) -> None:
 def watching(folder: Path) -> Iterator[None]:
     """Serve the page of a folder in a separate process, which stays up for a minute after the last request.
 
-    Its address is printed. The code in the block is independent of it. Raises AnimatError if its requirements are not
-    installed, or it does not start.
+    Its address is printed. Raises AnimatError if its requirements are not installed, or it does not start.
     """
     expect_installed()
     # In its own session: Ctrl-C ends only the command, and the page shows how it ended.

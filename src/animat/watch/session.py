@@ -26,7 +26,7 @@ from animat.robots.base import Robot
 from animat.robots.drawing import draw_robot
 from animat.stimulation.stimulus import NOTHING
 from animat.watch.discovery import is_locked
-from animat.watch.plain import mapped, number, numbers, packed, text
+from animat.watch.files import mapped, number, numbers, packed, text
 from animat.watch.tail import PercentilesSince, Sums, Tail, by_agent, first_readout
 from animat.watch.view import View, time_left
 
@@ -122,11 +122,8 @@ class SessionView(View):
         shown = self._between(from_s, to_s)
         ticks = [self._tick(at, record) for at, record in shown if record.fields.get("tick")]
         ticks = [tick for tick in ticks if tick["time_s"] <= to_s]
-        adapted = [
-            (span[1], first_readout(record.fields["percentiles_hz"]))
-            for _, record in shown
-            if "percentiles_hz" in record.fields and (span := _span(record.fields)) is not None
-        ]
+        changed = [record.fields for _, record in shown if "percentiles_hz" in record.fields]
+        adapted = [(span[1], first_readout(fields["percentiles_hz"])) for fields in changed if (span := _span(fields))]
         times_s = np.concatenate([np.empty(0), *(record.spike_times_s for _, record in shown)])
         rows = np.concatenate([np.empty(0, np.int64), *(record.spike_channels for _, record in shown)])
         spikes, counts = packed(times_s, rows, from_s, to_s, len(self._header.channels))
@@ -193,7 +190,6 @@ class SessionView(View):
         }
 
     def _state(self) -> dict[str, Any]:
-        """The session's state, with a message."""
         silent_s = max(0.0, time.time() - self.file.stat().st_mtime)
         silent = f"nothing was written for {format_duration(silent_s)}"
         stop = (self.folder / STOP_FILE).exists()

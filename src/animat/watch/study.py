@@ -8,18 +8,19 @@ import math
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from animat.errors import InvalidFile, some_of
 from animat.execution.task import PLANNED, UNFINISHED
 from animat.watch.discovery import changed_s, is_locked, state_of
-from animat.watch.files import JobProgress, job_progress, json_of, mean_of_episodes, text_of
-from animat.watch.plain import listed, mapped, number, text
+from animat.watch.files import JobProgress, arrays_in, job_progress, json_of, listed, mapped, number, text, text_of
 from animat.watch.view import View, Width, facts, in_blocks, table, time_left
 
 _MOST_RECEIPTS, _MOST_SHOWN = 5000, 300
 _CONTEXT = "context study"
 _FAILED = "A job that fails ends the study, and its command names it: the folder does not record it."
 _DONE, _COMPARISONS = "jobs/report.json", "tables/comparisons.csv"
-_MOST_CULTURES, _MOST_TABLE_BYTES = 10_000, 2**20
+_MOST_CULTURES, _MOST_TABLE_BYTES, _MOST_EPISODES_BYTES = 10_000, 2**20, 2**27
 _NOTE = "Mean returns over the cultures that are done, and in how many of them that of the second arm is larger."
 _Means = dict[tuple[str, str], tuple[float, float]]
 """The means of both arms on one culture, by comparison and robot."""
@@ -117,8 +118,15 @@ def _results_table(folder: Path, width: Width) -> dict[str, Any]:
 def _results_of(path: Path) -> list[list[Any]]:
     robot, arm = path.parts[-3:-1]
     if path.suffix == ".npz":
-        means = mean_of_episodes(path)
-        return [] if means is None else [[robot, arm, *means]]
+        names = "return", "actor", "over_time", "agent", "at_min"
+        if (arrays := arrays_in(path, names, _MOST_EPISODES_BYTES)) is None:
+            raise InvalidFile(f"{path}: expected the episodes of an arm")
+        returns, actors, over_time, agents, at_min = arrays
+        # Episodes over time are few per recording, and a comparison's episodes may be on another recording.
+        own = ~over_time.astype(bool) & (agents == "policy") & (at_min == at_min.max(initial=-np.inf))
+        return (
+            [[robot, arm, float(returns[own].mean()), len(np.unique(actors[own])), int(own.sum())]] if own.any() else []
+        )
     culture, robot = robot, arm
     rows = json_of(path)["rows"][:1]
     return [[robot, f"policies, {culture}", row["mean_return"], row["actors"], row["episodes"]] for row in rows]
@@ -185,12 +193,9 @@ class CulturesView(View):
         return {name: text(error) for name, error in list(failed.items())[:_MOST_CULTURES] if _is_name(name)}
 
     def _names(self) -> list[str]:
+        cultures = listed(json_of(self.file).get("cultures"))
         # A link may lead out of the folder.
-        names = [
-            name
-            for name in listed(json_of(self.file).get("cultures"))
-            if _is_name(name) and not (self.folder / name).is_symlink()
-        ]
+        names = [name for name in cultures if _is_name(name) and not (self.folder / name).is_symlink()]
         if not names:
             raise InvalidFile(f"{self.file}: expected the names of cultures, got none")
         return names[:_MOST_CULTURES]

@@ -16,7 +16,7 @@ from typing import Any
 from animat.closed_loop.log import HEAD, MAGIC, RECORD, Record, parse_fields, parse_record
 from animat.closed_loop.outline import Episode, Outline
 from animat.errors import InvalidFile
-from animat.watch.plain import mapped, number, numbers, text
+from animat.watch.files import mapped, number, numbers, text
 
 _KEPT = 4096
 """Number of records kept in memory: those of the last seconds are requested again and again."""
@@ -26,7 +26,6 @@ _BLOCK_BYTES = 2**20
 _LOOKS = 64
 """Records between two looks at the clock."""
 _MOST_FAULTS = 50
-"""Most faults shown."""
 _MOST_THRESHOLDS = 20_000
 """Most changes of thresholds kept; beyond it every second one is dropped, repeatedly."""
 _MOST_RETURNS = 200

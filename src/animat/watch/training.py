@@ -10,14 +10,15 @@ from typing import Any, TypeAlias
 import numpy as np
 from jaxtyping import Float64
 
+from animat.errors import InvalidFile
 from animat.execution.task import UNFINISHED
-from animat.training.policy import CURVE
+from animat.training.policy import CURVE, whole_curve
 from animat.watch.discovery import changed_s, state_of
-from animat.watch.files import JobProgress, curve_of_policy, curves_of_checkpoint, job_progress, json_of
-from animat.watch.plain import listed, mapped, number, settings, text
-from animat.watch.view import View, chart, curve, facts, in_blocks, table, time_left
+from animat.watch.files import JobProgress, arrays_in, expect_own, job_progress, json_of, listed, mapped, number, text
+from animat.watch.view import View, chart, curve, facts, in_blocks, settings, table, time_left
 
 _MOST_POLICIES = 1000
+_MOST_BYTES = 2**22
 _CHUNKS = 60
 """Parts of a training, and points of a learning curve."""
 _LEARNER = (
@@ -78,7 +79,7 @@ class TrainingView(View):
         # Checkpoints of groups on cores, and of all policies trained together on a GPU.
         unfinished = self.folder / UNFINISHED
         for path in (*unfinished.glob("from-p*.npz"), *unfinished.glob("at-once-*.npz")):
-            for i, rows in (self._content(path, curves_of_checkpoint) or {}).items():
+            for i, rows in (self._content(path, _curves_of_checkpoint) or {}).items():
                 curves[i], shares[i] = rows, min(1.0, len(rows) / _CHUNKS)
         for name, (share, _) in progress.items():
             members = re.fullmatch(r"p(\d{1,6})(?: to p(\d{1,6}))?", name)
@@ -86,7 +87,7 @@ class TrainingView(View):
                 last = min(int(members[2] or members[1]), planned - 1)
                 shares |= {i: max(shares[i], min(share, 1.0)) for i in range(int(members[1]), last + 1)}
         for i in range(planned):
-            if (rows := self._content(self.folder / f"p{i}.safetensors", curve_of_policy)) is not None:
+            if (rows := self._content(self.folder / f"p{i}.safetensors", _curve_of_policy)) is not None:
                 curves[i], shares[i] = rows, 1.0
         known = range(planned)
         return {i: curves[i] for i in known if i in curves}, {i: shares[i] for i in known}
@@ -99,6 +100,34 @@ class TrainingView(View):
         if self._read.get(path, (None,))[0] != time_s:
             self._read[path] = time_s, read(path)
         return self._read[path][1]
+
+
+def _curves_of_checkpoint(path: Path) -> Curves:
+    """The learning curves in a checkpoint, by policy number; empty if it cannot be read."""
+    arrays = arrays_in(path, ("curve", "members"), _MOST_BYTES)
+    if arrays is None or (curve := _complete(arrays[0], 3)) is None:
+        return {}
+    if arrays[1].dtype.kind not in "iu" or arrays[1].shape != curve.shape[1:2]:
+        return {}
+    return {int(member): curve[:, row] for row, member in enumerate(arrays[1].tolist())}
+
+
+def _curve_of_policy(path: Path) -> Float64[np.ndarray, "chunks columns"] | None:
+    """The learning curve in a policy's file; None if it cannot be read."""
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(expect_own(path), framework="numpy") as file:
+            return _complete(file.get_tensor("learning_curve"), 2)
+    except (InvalidFile, OSError, SafetensorError, ValueError, TypeError):
+        return None
+
+
+def _complete(curve: np.ndarray, dimensions: int) -> Float64[np.ndarray, "*_ columns"] | None:
+    """Learning curves with the columns of `CURVE`; None for anything else."""
+    whole = whole_curve(curve)
+    is_curve = whole.ndim == dimensions and whole.shape[-1] == len(CURVE) and whole.dtype.kind == "f"
+    return np.asarray(whole, np.float64) if is_curve else None
 
 
 def _in_use(training: dict[str, Any], minutes: list[float], share: float) -> list[tuple[str, Any]]:
@@ -191,8 +220,6 @@ def _series(curves: Curves, column: str) -> tuple[list[dict[str, Any]], float | 
     values = np.full((len(curves), len(longest)), np.nan)
     for row, rows in zip(values, curves.values(), strict=True):
         row[: len(rows)] = rows[:, at]
-    known = np.isfinite(values)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        mean = np.where(known, values, 0.0).sum(axis=0) / known.sum(axis=0)
+    mean = np.ma.masked_invalid(values).mean(axis=0).filled(np.nan)
     series.append(curve("mean of the policies", longest[:, 0].tolist(), mean.tolist(), "line", "blue"))
     return series, next((x for x in mean[::-1].tolist() if np.isfinite(x)), None)

@@ -9,10 +9,9 @@ from typing import Any
 
 from animat.errors import InvalidFile
 from animat.watch.discovery import state_of
-from animat.watch.files import json_of, text_of
-from animat.watch.plain import listed, mapped, number, settings, short, text
+from animat.watch.files import json_of, listed, mapped, number, text, text_of
 from animat.watch.study import running_jobs, running_table
-from animat.watch.view import View, chart, curve, facts, in_blocks, table, time_left
+from animat.watch.view import View, chart, curve, facts, in_blocks, settings, short, table, time_left
 
 _MOST_SHOWN = 300
 _STATES = {"complete": "complete", "stopped": "stopped early", "diverged": "diverged"}
@@ -108,9 +107,7 @@ def _chart(trials: list[dict[str, Any]], until: int | None) -> dict[str, Any]:
 
 
 def _table(trials: list[dict[str, Any]]) -> dict[str, Any]:
-    rows = [
-        [t["trial"], _STATES.get(t["state"], t["state"]), t["last"], settings(t["settings"])]
-        for t in trials[::-1][:_MOST_SHOWN]
-    ]
+    newest = trials[::-1][:_MOST_SHOWN]
+    rows = [[t["trial"], _STATES.get(t["state"], t["state"]), t["last"], settings(t["settings"])] for t in newest]
     head = ["trial", "state", "mean return", "settings"]
     return table("Journal", head, rows, "" if rows else "no trial is done yet", width="whole")

@@ -12,8 +12,7 @@ from typing import Any, ClassVar, Literal
 from animat.errors import InvalidArgument, InvalidFile, first_line
 from animat.folders import MARKERS, Kind
 from animat.progress import Speed, format_duration
-from animat.watch.files import json_of
-from animat.watch.plain import number, text
+from animat.watch.files import json_of, number, text
 
 _MOST_SPAN_S = 60.0
 """Longest span shown at once, and over which the speed of work is measured."""
@@ -132,3 +131,16 @@ def time_left(seconds: float | None, state: dict[str, Any]) -> str:
     if state["state"] != "running":
         return "none: it has ended" if state["state"] == "ended" else "none: it is not running"
     return "not known yet" if (known := number(seconds)) is None else format_duration(known)
+
+
+def short(value: Any) -> str:
+    """A setting in a few characters."""
+    known = number(value)
+    if known is None:
+        return text(value, 60)
+    return f"{known:,}" if isinstance(known, int) else f"{known:.4g}"
+
+
+def settings(values: dict[str, Any]) -> str:
+    """Settings by name, in a few characters each."""
+    return ", ".join(f"{text(name, 40)} {short(value)}" for name, value in values.items())

@@ -36,7 +36,7 @@ class ShortTerm:
 class TissueParameters:
     """The parameters of a virtual tissue; conductances are in units of the leak.
 
-    Marks: [L] from the literature, [C] calibrated to reproduce the figures of `docs/virtual-culture.md`.
+    Marks: [L] from the literature, [C] calibrated to reproduce the figures of `docs/evidence/virtual-culture.md`.
 
     Raises:
         InvalidArgument: for a number that is not finite or outside its range.

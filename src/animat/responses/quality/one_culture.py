@@ -66,10 +66,7 @@ def series_findings(series: Sequence[Responses]) -> Iterator[Finding]:
 
 
 def _different(tables: Sequence[Channels]) -> int:
-    """The most channels of any of these tables that are not in all of them.
-
-    They are compared by electrode if it is known of all, otherwise by label.
-    """
+    """The most channels of any table that are not in all: by electrode if it is known of all, otherwise by label."""
     knows = all(np.all(table.electrode != UNKNOWN) for table in tables)
     names = [table.electrode if knows else table.label for table in tables]
     in_all = set.intersection(*(set(each.tolist()) for each in names)) if names else set()

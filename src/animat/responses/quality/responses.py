@@ -299,11 +299,7 @@ def _difference(responses: Responses) -> Iterator[Finding]:
 
 
 def _readouts(responses: Responses) -> Iterator[Finding]:
-    """A finding on the worst pair of readouts that conditions do not separate, so that their commands go together.
-
-    P(x >= P50) of one less that of the other must differ between two conditions by `LITTLE_DIFFERENCE` plus two
-    standard errors.
-    """
+    """A finding on the worst pair of readouts whose difference in P(x >= P50) hardly varies between conditions."""
     names, conditions = responses.readouts.names, responses.conditions
     enough = [i for i in range(len(conditions)) if len(responses.rates_of(i)) >= FEW_SAMPLES]
     if len(names) < 2 or len(enough) < 2:

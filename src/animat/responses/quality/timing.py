@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float64
 from animat.recordings.findings import Finding
 from animat.recordings.recording import Recording
 from animat.responses.psth import PostStimulusHistogram, post_stimulus_histogram, spontaneous_rate
+from animat.responses.windows import Window
 
 BIN_MS = 0.5
 SPAN_MS = (-10.0, 20.0)
@@ -35,9 +36,7 @@ WHOLE, NEARLY_ALL = 0.01, 0.99
 """How close intervals must be to a whole number of steps, and the share of intervals that must be."""
 
 
-def artefact_findings(
-    recording: Recording, window_ms: tuple[float, float], *, is_elsewhere: bool = False
-) -> Iterator[Finding]:
+def artefact_findings(recording: Recording, window_ms: Window, *, is_elsewhere: bool = False) -> Iterator[Finding]:
     """Findings on spikes that are artefacts (`artefact-spikes`) and on blanked stretches (`blanked-window`).
 
     Both use the spikes b(t) in half-millisecond bins from the stimulus. The artefact is the run of bins around the
@@ -97,7 +96,6 @@ def _artefact(
     spike_times_s: Float64[np.ndarray, " spikes"],
     stimulus_s: Float64[np.ndarray, " stimuli"],
 ) -> Bool[np.ndarray, " bins"]:
-    """The bins of the artefact; none if there is none."""
     edges_ms, count = histogram.edges_ms, histogram.count
     from_ms = edges_ms[:-1]
     above = (count > TIMES * usual) & (from_ms >= LOOKED_AT_MS[0]) & (from_ms < LOOKED_AT_MS[1])
@@ -136,7 +134,7 @@ def _blank(
     histogram: PostStimulusHistogram,
     artefact: Bool[np.ndarray, " bins"],
     spontaneous: float,
-    window_ms: tuple[float, float],
+    window_ms: Window,
     is_elsewhere: bool,
 ) -> Iterator[Finding]:
     is_blank = (histogram.count < spontaneous / TIMES) | artefact
@@ -161,7 +159,7 @@ def _blank(
     yield Finding("blanked-window", "note" if lost <= 0.15 else "warning", message, min(lost, 1.0))
 
 
-def resolution_findings(recording: Recording, window_ms: tuple[float, float]) -> Iterator[Finding]:
+def resolution_findings(recording: Recording, window_ms: Window) -> Iterator[Finding]:
     """A finding on spike times that come in steps of more than a quarter of the window (`coarse-times`).
 
     The step is the shortest interval between different spike times, if nearly all intervals are whole multiples of it.
