@@ -369,7 +369,7 @@ def test_a_table_of_responses_has_a_row_for_each() -> None:
     recording = synthetic_recording(1, patterns=4, channels=16, start_min=5.0)
     responses = extract_responses(recording, readouts="halves")
     table = responses.to_frame()
-    names = [f"{name}_hz" for name in responses.readouts.names]
+    names = [f"rate_hz_{name}" for name in responses.readouts.names]
     assert list(table) == ["condition", "rate_hz", "active_ratio", "is_burst", "start_min", "time_s", *names]
     # Each half has 8 of the 16 channels, so x of all channels is the mean of both.
     np.testing.assert_allclose(table[names].mean(axis="columns"), table["rate_hz"])

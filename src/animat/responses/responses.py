@@ -185,7 +185,7 @@ class Responses:
         """A table with a row for each response.
 
         Its columns are `condition` (the label), `rate_hz`, `active_ratio`, `is_burst`, `start_min` of the recording,
-        `time_s` if it is known, and for each of several readouts its x, `NAME_hz`.
+        `time_s` if it is known, and for each of several readouts its x, `rate_hz_NAME`.
         """
         from pandas import DataFrame
 
@@ -196,7 +196,7 @@ class Responses:
             columns["time_s"] = self.time_s
         if self.readout_hz is not None:
             each = self.readout_hz.reshape(len(self), -1).T
-            columns |= {f"{name}_hz": x for name, x in zip(self.readouts.names, each, strict=True)}
+            columns |= {f"rate_hz_{name}": x for name, x in zip(self.readouts.names, each, strict=True)}
         return DataFrame(columns)
 
     def bootstrapped(self, rng: np.random.Generator) -> Responses:
