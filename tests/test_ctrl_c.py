@@ -182,7 +182,11 @@ def test_an_interrupted_session_is_reported_as_not_resumable(tmp_path, monkeypat
     assert "recover" not in capsys.readouterr().err
     monkeypatch.setattr("animat.cli.live.Live.run", interrupted)
     assert animat(["live", "cartpole", "--out", str(tmp_path)]) == 130
-    assert "kept; a live run cannot be resumed: start a new one in another folder\n" in capsys.readouterr().err
+    assert capsys.readouterr().err.endswith("kept; a live run cannot be resumed: start a new one in another folder\n")
+    (tmp_path / "session").mkdir()
+    (tmp_path / "session" / "session.log").touch()
+    assert animat(["live", "cartpole", "--out", str(tmp_path)]) == 130
+    assert f"not written yet: animat recover {tmp_path / 'session'}; finished" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("status", "printed"), [(0, "all\nat exit\n"), (1, "all\nat exit\n"), (130, "all\n")])

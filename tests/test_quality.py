@@ -15,7 +15,7 @@ from animat.recordings.quality import recording_findings
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
 from animat.responses.condition import Condition
-from animat.responses.extraction import extract_responses
+from animat.responses.extraction import extract_responses, extract_series
 from animat.responses.inspection import inspect_recording
 from animat.responses.quality import drift
 from animat.responses.quality.drift import drift_findings
@@ -208,10 +208,15 @@ def test_channels_that_stop() -> None:
     assert "stopped-channels" not in found(np.ones(3000, np.bool_))
     one = found((channel != 7) | (time_s < 350))["stopped-channels"]
     assert (one.severity, one.value) == ("note", 1)
-    assert "but not after 260 s: 1 of 40 (7);" in one.message
+    assert "channels that fire steadily and then stop, at about 260 s: 1 of 40 (7);" in one.message
     several = found((channel > 3) | (time_s < 320 + 10 * channel))["stopped-channels"]
     assert (several.severity, several.value) == ("warning", 4)
-    assert "but not after 220 s to 260 s: 4 of 40 (0, 1, 2, 3);" in several.message
+    assert "and then stop, between 220 s and 260 s: 4 of 40 (0, 1, 2, 3);" in several.message
+    # What warns of a recording is with its responses too, for those who never inspect it; notes are not.
+    rows = np.column_stack([time_s - 100, channel])[(channel > 3) | (time_s < 320)]
+    (responses,) = extract_series([recording(rows, [1, 2], 40, 400.0)], allow=["dead-window"])
+    names = [finding.name for finding in responses.findings]
+    assert names.count("stopped-channels") == 1 and "silent-channels" not in names
     # Silent at the beginning, or for less than a quarter of the recording, or most of the time.
     for is_kept in (time_s > 250, time_s < 419, time_s < 170):
         assert "stopped-channels" not in found((channel != 7) | is_kept)

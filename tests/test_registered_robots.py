@@ -397,7 +397,7 @@ def test_it_is_a_gymnasium_environment_and_is_drawn_where_it_can_be(package: Pat
     with pytest.raises(InvalidArgument, match="rover has no method `draw`"):
         gymnasium.make("animat:Animat/Robot-v0", robot=ROVER, render_mode="rgb_array")
     for make in (gymnasium.make, gymnasium.make_vec):
-        with pytest.raises(InvalidArgument, match=r"robot: expected a name, as in .* robot='arm'\), got none"):
+        with pytest.raises(InvalidArgument, match=r"robot: expected a name, as in .* robot='shuttle'\), got none"):
             make("animat:Animat/Robot-v0")
 
     def drawing(returned: str) -> Callable[[], Any]:

@@ -154,13 +154,12 @@ def _what_is_left(command: Command) -> str:
     """What an interrupted command has kept, and how to go on."""
     if not isinstance(command, FolderCommand) or not is_folder(command.out) or not any(command.out.iterdir()):
         return ""
-    if isinstance(command, Run) and (command.out / "session.log").exists():
-        recover = f"; its recording is not written yet: animat recover {shlex.quote(str(command.out))}"
-        recover = "" if (command.out / "session.nwb").exists() else recover
-        return f"{recover}; finished work is kept; a session cannot be resumed: start a new one in another folder"
-    if isinstance(command, Live):
-        return "; finished work is kept; a live run cannot be resumed: start a new one in another folder"
-    return f"; finished work is kept{'' if isinstance(command, Run) else '; run it again to resume'}"
+    if not isinstance(command, Run | Live):
+        return "; finished work is kept; run it again to resume"
+    what, session = ("session", command.out) if isinstance(command, Run) else ("live run", command.out / "session")
+    is_unwritten = (session / "session.log").exists() and not (session / "session.nwb").exists()
+    recover = f"; its recording is not written yet: animat recover {shlex.quote(str(session))}" if is_unwritten else ""
+    return f"{recover}; finished work is kept; a {what} cannot be resumed: start a new one in another folder"
 
 
 _RENAMED = {

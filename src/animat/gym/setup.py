@@ -98,7 +98,9 @@ def set_up(
         UnusableData: for recordings that no controller can learn from.
     """
     if robot == "":
-        raise InvalidArgument("robot: expected a name, as in gymnasium.make('Animat/Robot-v0', robot='arm'), got none")
+        raise InvalidArgument(
+            "robot: expected a name, as in gymnasium.make('Animat/Robot-v0', robot='shuttle'), got none"
+        )
     body = robot_named(robot, **parameters)
     if isinstance(body, HostRobot):
         raise InvalidArgument(

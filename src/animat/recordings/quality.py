@@ -137,9 +137,10 @@ def _stopped_channels(recording: Recording) -> Iterator[Finding]:
     if not (several := int(np.count_nonzero(stopped))):
         return
     last_s = recording.start_s + part_s * until[stopped]
-    when = f"{last_s.min():.0f} s" + (f" to {last_s.max():.0f} s" if last_s.max() > last_s.min() else "")
+    first, last = f"{last_s.min():.0f} s", f"{last_s.max():.0f} s"
+    when = f"at about {last}" if first == last else f"between {first} and {last}"
     message = (
-        f"channels that fire steadily, but not after {when}: {several:,} of {n:,} "
+        f"channels that fire steadily and then stop, {when}: {several:,} of {n:,} "
         f"({some_of(recording.channels.label[stopped].tolist(), NAMED)}); they count in rates per channel: check their "
         "contact, or leave them out of the routing"
     )

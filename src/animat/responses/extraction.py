@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -191,7 +191,8 @@ def extract_series(
         except (UnusableData, Mismatch) as error:
             # Appended, as the message begins with the argument.
             raise type(error)(f"{error} (the recording at {in_min(recording.start_min)})") from error
-        for finding in (*recording_findings(recording), *responses.findings):
+        responses = replace(responses, findings=(*_on_recording(recording, responses), *responses.findings))
+        for finding in responses.findings:
             if finding.severity == "refuse" and finding.name not in allow:
                 can_fit = finding.name not in _NOTHING_TO_FIT
                 remedy = f" (to allow it: {_allowing(finding)}, or in a study simulators.allow)" if can_fit else ""
@@ -201,6 +202,14 @@ def extract_series(
         if finding.severity == "refuse" and finding.name not in allow:
             raise UnusableData(f"recordings: {finding.message} (to allow it: {_allowing(finding)})")
     return series
+
+
+def _on_recording(recording: Recording | ResponseTable, responses: Responses) -> Iterator[Finding]:
+    """What else the recording is refused or doubted for; of warnings with the same name the responses' say more."""
+    known = {finding.name for finding in responses.findings}
+    for finding in recording_findings(recording):
+        if finding.severity == "refuse" or (finding.severity == "warning" and finding.name not in known):
+            yield finding
 
 
 def _allowing(finding: Finding) -> str:
