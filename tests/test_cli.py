@@ -447,7 +447,7 @@ BAD = {
     "two protocols": (
         nothing,
         ["record", "--protocol", "{folder}/a.json", "--paper"],
-        ["animat: --protocol: expected it without --paper, which is another protocol; leave one out"],
+        ["animat: --protocol, --paper: expected one of them, as each is a protocol, got both"],
     ),
     "a file for the folder of figures": (
         lambda folder, *_: (folder / "taken").write_text("x"),
@@ -812,7 +812,11 @@ def test_an_error_of_an_argument_begins_with_its_option(
         (["convert", "a.csv", "--uot", "b.nwb"], 2, ["animat: unknown option --uot; did you mean --out?"]),
         (["--hepl"], 2, ["animat: unknown option --hepl; did you mean --help?"]),
         (["--versoin"], 2, ["animat: unknown option --versoin; did you mean --version?"]),
-        (["train", "cartpole", "pole"], 2, ["animat: unexpected argument 'pole'; see animat train --help"]),
+        (
+            ["train", "cartpole", "pole"],
+            2,
+            ["animat: unexpected argument 'pole'; recordings are named after --recordings; see animat train --help"],
+        ),
         (["train", "--robot", "pole"], 2, ["animat: robot: expected only its value, got --robot before it; see"]),
         (["train", "--seed=3", "--policies"], 2, ["animat: --policies: expected a value after it, got none; see"]),
         (["convert", "a.csv"], 2, ["animat: --out: expected a value, got none; see animat convert --help"]),

@@ -84,6 +84,7 @@ def test_a_session_takes_its_pauses_and_what_is_presented() -> None:
     longer = outlook(replace(loop, settling=3), calibration, plan, account, 15.0)
     longer_s = total_s + 3 * (3 + 6 / 5 + 6 / 80)
     assert longer.planned_min == pytest.approx(longer_s / 60)
+    assert longer.settling_min == pytest.approx((longer_s - total_s) / 60) and found.settling_min == 0
     assert longer.budget_min == pytest.approx(longer_s / 60 * 94 / (4 * 94 + 36))
     # Of two pulses each, without a warm-up: 90 trials, and twelve in the settling.
     twice = outlook(replace(loop, pulses=2, warm_up=0, settling=1), calibration, [(1, plan[0][1], True)], account, 15.0)
@@ -115,4 +116,8 @@ def test_the_outlook_is_one_line() -> None:
     assert str(Outlook(6.0, None, 7.0)) == (
         "the session is planned for about 6 min of the culture's time; at least two recordings are needed to estimate "
         "the culture's drift; the budget of pulses lasts for about 7 min"
+    )
+    # Fewer episodes would not help.
+    assert str(Outlook(6.0, None, 0.4, 1.5)).endswith(
+        "lasts for about 0 min, but the settling before the first episode takes 1.5 min (--settling)"
     )

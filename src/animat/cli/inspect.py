@@ -45,11 +45,12 @@ class Inspect(ResponseOptions):
         from animat.responses.inspection import inspect_recording
         from animat.responses.quality.one_culture import series_findings, unlike_finding
         from animat.responses.windows import DEFAULT_WINDOW_MS, check_window
+        from animat.robots.grid import grid_for
         from animat.robots.registry import robot_named
 
         if self.optimum is not None:
             try:
-                robot_named(self.optimum)
+                grid_for(robot_named(self.optimum))
             except InvalidArgument as error:
                 raise InvalidArgument(f"--optimum: {str(error).removeprefix('robot: ')}") from error
         by = None if self.conditions is None else conditions_named(self.conditions)

@@ -135,7 +135,7 @@ def run_policies(
     if with_interventions:
         if isinstance(loop.robot, HostRobot):
             raise InvalidArgument(
-                f"--interventions: expected a robot in JAX, got {loop.robot.name}, which is stepped on the host"
+                f"--interventions: expected a robot in JAX, got {loop.robot.name}, which is stepped outside JAX"
             )
         simulated = {"episodes": INTERVENTION_EPISODES, "seed": seed}
         half_way = trained.run(environment, simulator, **simulated).half_way
@@ -253,7 +253,7 @@ def _warnings(first: Policy, loop: Loop, calibration: Calibration, now_min: floa
     if isinstance(loop.robot, HostRobot):
         episodes_predicted = ROLL_OUTS * episodes_on_host(loop.robot)
         message = (
-            f"{loop.robot.name} is stepped on the host: predicted returns are from {episodes_predicted} episodes, and "
+            f"{loop.robot.name} is stepped outside JAX: predicted returns are from {episodes_predicted} episodes, and "
             f"their intervals from {BOOTSTRAPS_ON_HOST} bootstraps"
         )
         yield Finding("few-predicted", "note", message)
