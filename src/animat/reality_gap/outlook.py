@@ -71,9 +71,9 @@ def outlook(
     calibration: Calibration,
     episodes: Sequence[tuple[int, Float64[np.ndarray, " conditions"], bool]],
     account: Account,
-    now_min: float,
+    age_min: float,
 ) -> Outlook:
-    """How long a session will be and can be from `now_min` of the culture's clock on.
+    """How long a session will be and can be, that much later than the recording.
 
     `episodes` has for each agent the number of episodes, how often each condition is presented in one of them, and
     whether the culture gets pulses.
@@ -89,8 +89,8 @@ def outlook(
     settling_s = settling * (loop.pause_s + SETTLING_ROUNDS * float(interval_s.sum()))
     total_s += settling_s
     pulses += settling * SETTLING_ROUNDS * loop.pulses * int(gives.sum())
-    # A clock before the recording was restarted (a MaxOne's starts with each program): its age is not known.
-    of, drift, since_min = account.budget.pulses, calibration.drift, min(0.0, calibration.start_min - now_min)
+    # On a clock that was restarted, the age is not known.
+    of, drift, since_min = account.budget.pulses, calibration.drift, min(0.0, -age_min)
     return Outlook(
         total_s / 60,
         None if drift is None else tuple(since_min + each for each in drift.minutes_to(LARGE)),  # type: ignore[arg-type]

@@ -113,7 +113,8 @@ def run_policies(
     if first.neural_observation:
         settings["remembering"] = calibration.remembering
     loop, findings = Loop.of_policy(first, calibration.percentiles, pulses=pulses, **settings)
-    findings += tuple(_warnings(first, loop, calibration, culture.now_s / 60))
+    age_min = calibration.age_min(culture)
+    findings += tuple(_warnings(first, loop, calibration, age_min))
     account = account or Account()
     animat = Animat(loop.robot, loop.mapping, len(loop.conditions))
     environment: Environment[Any] = NeuralObservation(animat) if first.neural_observation else animat
@@ -170,7 +171,7 @@ def run_policies(
     plan = [
         (n, predicted[each.name].presented, each.delivery != "silent") for n, each in zip(of_each, agents, strict=True)
     ]
-    expected = outlook(loop, calibration, plan, account, culture.now_s / 60)
+    expected = outlook(loop, calibration, plan, account, age_min)
     findings = (*noticed, *findings, *calibration.findings)
     if report is not None:
         # Before the first pulse, so that the operator can still stop.
@@ -224,7 +225,7 @@ def run_policies(
     )
 
 
-def _warnings(first: Policy, loop: Loop, calibration: Calibration, now_min: float) -> Iterator[Finding]:
+def _warnings(first: Policy, loop: Loop, calibration: Calibration, age_min: float) -> Iterator[Finding]:
     """Known reasons why the measured return may differ from the prediction."""
     yield from transfer.other_calibration(first.presentation, calibration.presentation)
     if first.delivery == "shuffled":
@@ -248,7 +249,7 @@ def _warnings(first: Policy, loop: Loop, calibration: Calibration, now_min: floa
         yield Finding("moving-percentiles", "warning", message)
     yield from transfer.other_simulator(first.fitted, calibration.fitted)
     yield from transfer.other_culture(first.culture, calibration.culture)
-    yield from transfer.old_calibration(calibration.start_min, now_min)
+    yield from transfer.old_calibration(age_min, "this session")
     yield from transfer.no_memory(calibration.findings, calibration.presentation, has_memory=has_memory)
     if isinstance(loop.robot, HostRobot):
         episodes_predicted = ROLL_OUTS * episodes_on_host(loop.robot)

@@ -11,7 +11,7 @@ from jaxtyping import Float64, Int64
 
 from animat.errors import UnusableData
 from animat.recordings.findings import Finding, merged
-from animat.recordings.metadata import culture_of
+from animat.recordings.metadata import culture_of, date_of
 from animat.recordings.recording import Channels, Recording
 from animat.recordings.time_quality import late_start
 from animat.stimulation.protocol import Presentation
@@ -97,6 +97,7 @@ class PlainColumns:
             presentation=presentation,
             provenance={**provenance, **names},
             culture=culture_of(provenance),
+            recorded_at=date_of(provenance),
             findings=merged(noted),
         )
 
