@@ -620,6 +620,11 @@ BAD = {
         ["train", "cartpole", "--mapping", "none", "--iterations", "6000", "--out", "{folder}"],
         ["expected a folder of this training, got one of another (training: [1] there, {{'"],
     ),
+    "a closed loop of policies without neurons": (
+        lambda folder, *_: WITHOUT_NEURONS.save(folder / "p0.safetensors"),
+        ["run", "{folder}", "--out", "{folder}/session"],
+        ["animat: policies: expected some that act through neurons, got some that were trained without"],
+    ),
     "recordings for policies without neurons": (
         lambda folder, *_: WITHOUT_NEURONS.save(folder / "p0.safetensors"),
         ["evaluate", "{folder}", "--recordings", "{recordings}"],

@@ -159,7 +159,8 @@ class Run(StimulationOptions):
 
     def _calibration(self, recordings: Sequence[Recording], first: Policy, fit: dict[str, Any]) -> Calibration:
         """The calibration by the recordings' responses, read by the options and otherwise as in the training."""
-        from animat.reality_gap import Calibration, check_conditions
+        from animat.evaluation.transfer import expect_conditions
+        from animat.reality_gap import Calibration
         from animat.responses.extraction import extract_series
 
         trained = first.fitted.get("burst_threshold")
@@ -173,7 +174,7 @@ class Run(StimulationOptions):
         )
         adaptive = self.thresholds == "adaptive"
         calibration = Calibration.of_series(series, first, at_min=self.at_min, adaptive=adaptive, **fit)
-        check_conditions(first, calibration)
+        expect_conditions(first, calibration.conditions, calibration.readouts)
         return calibration
 
     def _report(self, gap: RealityGap) -> None:

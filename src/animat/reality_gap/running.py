@@ -23,7 +23,7 @@ from animat.cultures.budget import Account
 from animat.cultures.failures import describe_error
 from animat.cultures.virtual import VirtualCulture
 from animat.environment import Animat, Environment
-from animat.errors import InvalidArgument
+from animat.errors import InvalidArgument, UnusableData
 from animat.evaluation import transfer
 from animat.evaluation.controls import RANDOM, Control, controls_of, coupling_of, interventions_of
 from animat.evaluation.optimal_returns import too_few
@@ -104,7 +104,7 @@ def run_policies(
         UnusableData: for policies without neurons.
     """
     first = check_policies(policies)
-    check_conditions(first, calibration)
+    transfer.expect_conditions(first, calibration.conditions, calibration.readouts)
     settings = {"burst_threshold": calibration.burst_threshold, **settings}
     if calibration.adaptive:
         settings["adaptive_from"] = calibration.adjusted
@@ -302,16 +302,14 @@ def _wait_for_optimum(optimum: Future[float], progress: Progress | None) -> floa
 def check_policies(policies: Mapping[str, Policy]) -> Policy:
     """The first of policies that can take turns in one closed loop, which represents all.
 
-    Raises InvalidArgument for no policies, and Mismatch if they differ in more than in their networks.
+    Raises InvalidArgument for no policies, Mismatch if they differ in more than in their networks, and UnusableData for
+    policies without neurons.
     """
     alike = ("robot", "mapping", "readouts", "conditions", "commands", "presentation", "window_ms", "fitted")
-    return first_of_alike(policies, (*alike, "percentiles", "delivery", "pulse_cost"), "run it alone")
-
-
-def check_conditions(first: Policy, calibration: Calibration) -> None:
-    """Raise Mismatch unless a calibration has the policies' conditions and readouts."""
-    if first.mapping is not None:
-        transfer.expect_conditions(first, calibration.conditions, calibration.readouts)
+    first = first_of_alike(policies, (*alike, "percentiles", "delivery", "pulse_cost"), "run it alone")
+    if first.mapping is None:
+        raise UnusableData("policies: expected some that act through neurons, got some that were trained without")
+    return first
 
 
 def _rows(
