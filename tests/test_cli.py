@@ -15,6 +15,7 @@ from collections.abc import Callable
 from dataclasses import asdict, fields, is_dataclass
 from importlib.metadata import version
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import docstring_parser
@@ -33,17 +34,22 @@ from animat.evaluation.optimum import Optimum, best_return
 from animat.neurons.timeline import fit_timeline
 from animat.recordings.findings import Finding
 from animat.recordings.reading import read_recordings
+from animat.responses.condition import Condition
 from animat.responses.extraction import extract_series
-from animat.robots import Cartpole
+from animat.robots import Cartpole, robot_named
 from animat.training.policy import Policy
 from animat.training.settings import SAC
 from animat.watch.training import TrainingView
 from rig_files import event_table, mapping_table, spike_table, write_maxwell
 from synthetic_recordings import write_synthetic_series
-from test_evaluation import WITHOUT_NEURONS
+from test_evaluation import WITHOUT_NEURONS, policy_of
 
 pytestmark = pytest.mark.usefixtures("in_this_process")
 
+TWO_CONDITIONS: Any = SimpleNamespace(
+    conditions=(Condition("5 Hz", 5.0, "Hz"), Condition("80 Hz", 80.0, "Hz")), window_ms=(2.0, 10.0), presentation=None
+)
+PENDULUM = policy_of(TWO_CONDITIONS, robot_named("gymnasium:Pendulum-v1"))
 QUICK = ["--policies", "2", "--iterations", "1000"]
 
 
@@ -625,6 +631,14 @@ BAD = {
         ["run", "{folder}", "--out", "{folder}/session"],
         ["animat: policies: expected some that act through neurons, got some that were trained without"],
     ),
+    **{
+        f"{option} for a robot stepped outside JAX": (
+            lambda folder, *_: PENDULUM.save(folder / "p0.safetensors"),
+            ["run", "{folder}", "--recordings", "{recordings}", *option.split(), "--out", "{folder}/session"],
+            [f"animat: {option}: expected a robot in JAX, got gymnasium:Pendulum-v1; leave it out"],
+        )
+        for option in ("--interventions", "--controls coupling")
+    },
     "recordings for policies without neurons": (
         lambda folder, *_: WITHOUT_NEURONS.save(folder / "p0.safetensors"),
         ["evaluate", "{folder}", "--recordings", "{recordings}"],

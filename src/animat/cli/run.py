@@ -151,10 +151,10 @@ class Run(StimulationOptions):
                 "--recordings: expected those that the policies were trained on, got none: make some with "
                 "`animat record`, and train on them"
             )
-        if isinstance(first.robot, HostRobot) and (self.interventions or self.controls == "coupling"):
-            raise InvalidArgument(
-                f"--interventions, --controls coupling: expected a robot in JAX, got {first.robot.name}; leave them out"
-            )
+        in_jax = {"--interventions": self.interventions, "--controls coupling": self.controls == "coupling"}
+        for option in (option for option, is_given in in_jax.items() if is_given):
+            if isinstance(first.robot, HostRobot):
+                raise InvalidArgument(f"{option}: expected a robot in JAX, got {first.robot.name}; leave it out")
         return policies, first
 
     def _calibration(self, recordings: Sequence[Recording], first: Policy, fit: dict[str, Any]) -> Calibration:
