@@ -215,7 +215,11 @@ def _conditions(responses: Responses) -> Iterator[Finding]:
         n = len(responses.rates_of(i))
         if not n:
             none = "no stimulus whose response window lies in the recording"
-            what = f"{n_all} stimuli, all of them bursts (--burst-threshold 1 keeps them)" if n_all else none
+            what = (
+                f"only bursts, after {counted(n_all, 'stimulus', 'stimuli')} (--burst-threshold 1 keeps them)"
+                if n_all
+                else none
+            )
             message = f"condition {condition.label}: {what}; leave it out or choose other conditions (--conditions)"
             yield Finding("empty-condition", "refuse", message, 0.0)
         elif n < FEW_SAMPLES:
