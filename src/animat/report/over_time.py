@@ -10,7 +10,8 @@ from jaxtyping import Float64
 
 from animat.evaluation.statistics import CONFIDENCE
 from animat.lazy import Figure
-from animat.report.style import BLUE, GREY, OPTIMUM, PALETTE, add_common_legend, grid_of_panels, style_axes, wrapped
+from animat.report.colours import BLUE, GREY, OPTIMUM, PALETTE
+from animat.report.style import add_common_legend, grid_of_panels, style_axes, wrapped
 
 _NARROW_IN, _WIDE_IN = 3.1, 4.6
 """Widths of a panel with a learning curve, and of one with returns at every recording."""

@@ -11,7 +11,8 @@ from jaxtyping import Float64
 from animat.lazy import Figure
 from animat.neurons.prediction import LAGS
 from animat.neurons.validation import FREE_RUNS, MARGINAL, PIT_BINS, Band, Validation, pit_shares
-from animat.report.style import BLACK, BLUE, GREEN, GREY, ORANGE, add_common_legend, new_figure, style_axes
+from animat.report.colours import BLACK, BLUE, GREEN, GREY, ORANGE
+from animat.report.style import add_common_legend, new_figure, style_axes
 
 _COLOURS = {MARGINAL: GREY, "histogram": ORANGE, "empirical": GREEN, "memory": BLUE}
 _HEADER = f"  {'simulator':<11}{'bits/trial':>11}{'CRPS (Hz)':>11}{'off by (p)':>14}{'lag 1':>8}{'run length':>25}"

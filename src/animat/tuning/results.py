@@ -12,19 +12,8 @@ from statistics import fmean, stdev
 from typing import Any
 
 from animat.lazy import Figure
-from animat.report.style import (
-    BLACK,
-    BLUE,
-    GREY,
-    ORANGE,
-    PURPLE,
-    RED,
-    SKY,
-    add_common_legend,
-    new_figure,
-    save_figure,
-    style_axes,
-)
+from animat.report.colours import BLACK, BLUE, GREY, ORANGE, PURPLE, RED, SKY
+from animat.report.style import add_common_legend, new_figure, save_figure, style_axes
 from animat.studies.folder import RECORDINGS
 from animat.studies.toml import study_to_toml
 from animat.tuning.search import TrialResult, importance_of
