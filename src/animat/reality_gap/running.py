@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, wait
 from dataclasses import replace
 from typing import Any
 
@@ -21,7 +19,6 @@ from animat.coding.encoder import electrode_pulses
 from animat.cultures.base import Culture
 from animat.cultures.budget import Account
 from animat.cultures.failures import describe_error
-from animat.cultures.virtual import VirtualCulture
 from animat.environment import Animat, Environment
 from animat.errors import InvalidArgument
 from animat.evaluation import transfer
@@ -31,7 +28,6 @@ from animat.evaluation.optimum import optimal_values
 from animat.evaluation.rollouts import networks_of
 from animat.evaluation.statistics import compare_episodes
 from animat.goals.tally import Outcome
-from animat.neurons.simulator import NeuronSimulator
 from animat.progress import Progress, in_phase
 from animat.reality_gap.calibration import Calibration
 from animat.reality_gap.outlook import outlook
@@ -163,10 +159,16 @@ def run_policies(
         seed=seed,
         progress=in_phase(progress, "predicting"),
     )
-    optimum = _begin_optimum(animat, simulator) if why_no_optimum is None else None
-    if optimum is not None and (loop.real_time or not isinstance(culture, VirtualCulture)):
-        # Such a loop must not wait for a core.
-        _wait_for_optimum(optimum, progress)
+    optimum = None
+    if why_no_optimum is None:
+        # Before the session, as a loop must not wait for a core.
+        in_phase(progress, "optimal return").update(0, 1, "computing it on the simulator")
+        try:
+            # Only the value, which is reported as "about": its uncertainty would take a third longer.
+            values, _ = optimal_values([(animat, simulator)], grid_for(loop.robot).scaled(_RESOLUTION), seed=1)
+            optimum = float(values[0])
+        except Exception as error:
+            findings += (Finding("no-optimum", "note", f"no optimal return: {describe_error(error)}"),)
     plan = [
         (n, predicted[each.name].presented, each.delivery != "silent") for n, each in zip(of_each, agents, strict=True)
     ]
@@ -178,32 +180,18 @@ def run_policies(
             report(f"warning: {message}")
         report(f"each pulse: {loop.pulse}")
         report(str(expected))
-    try:
-        expect_writable(folder, room_bytes=expected.room_bytes)
-        session = run_session(
-            culture,
-            loop,
-            agents,
-            folder,
-            episodes=of_each,
-            seed=seed,
-            account=account,
-            progress=in_phase(progress, "closed loop", sum(of_each), "episodes"),
-            predicted={
-                name: bootstrap_interval(of.returns.mean(), of.bootstrap_means) for name, of in predicted.items()
-            },
-        )
-    except Exception:
-        # A program that exits while JAX computes is killed by a signal.
-        wait([] if optimum is None else [optimum])
-        raise
-    best = None
-    # A user who stopped the session does not wait for it; after any other ending the program would exit meanwhile.
-    if optimum is not None and (optimum.done() or session.ending.by != "person"):
-        try:
-            best = _wait_for_optimum(optimum, progress)
-        except Exception as error:
-            findings += (Finding("no-optimum", "note", f"no optimal return: {describe_error(error)}"),)
+    expect_writable(folder, room_bytes=expected.room_bytes)
+    session = run_session(
+        culture,
+        loop,
+        agents,
+        folder,
+        episodes=of_each,
+        seed=seed,
+        account=account,
+        progress=in_phase(progress, "closed loop", sum(of_each), "episodes"),
+        predicted={name: bootstrap_interval(of.returns.mean(), of.bootstrap_means) for name, of in predicted.items()},
+    )
     rows = _rows(agents, tuple(policies), predicted, session, loop, first.pulse_cost)
     gap_reasons: tuple[Finding, ...] = ()
     if sign := rows[0].gap_sign:
@@ -212,7 +200,7 @@ def run_policies(
     return RealityGap(
         loop=loop,
         calibrated_at_min=calibration.start_min,
-        optimum=best,
+        optimum=optimum,
         rows=rows,
         session=session,
         account=account,
@@ -271,31 +259,6 @@ def _why_no_optimum(loop: Loop, calibration: Calibration) -> str | None:
     if few := too_few(loop.conditions, [len(responses) for responses in calibration.responses_hz]):
         reason = f"these conditions have too few responses: {', '.join(few)}"
     return None if reason is None else lacking(loop.robot).get("value_grid", f"no optimal return: {reason}")
-
-
-def _begin_optimum(environment: Animat[Any], simulator: NeuronSimulator) -> Future[float]:
-    """The optimal return, computed in a background thread, on another core than a loop without deadlines."""
-    optimum: Future[float] = Future()
-
-    def work() -> None:
-        try:
-            # Only the value, which is reported as "about": its uncertainty would take a third longer.
-            grid = grid_for(environment.robot).scaled(_RESOLUTION)
-            (value,), _ = optimal_values([(environment, simulator)], grid, seed=1)
-            optimum.set_result(float(value))
-        except BaseException as error:
-            optimum.set_exception(error)
-
-    # A daemon, so that a user who stops the program need not wait for it.
-    threading.Thread(target=work, name="optimal return", daemon=True).start()
-    return optimum
-
-
-def _wait_for_optimum(optimum: Future[float], progress: Progress | None) -> float:
-    """Wait for the value, or raise the error because of which it could not be computed."""
-    if not optimum.done():
-        in_phase(progress, "optimal return").update(0, 1, "computing it on the simulator")
-    return optimum.result()
 
 
 def check_policies(policies: Mapping[str, Policy]) -> Policy:

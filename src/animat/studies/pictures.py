@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
-from typing import Any, final
+from typing import Any
 
 import numpy as np
 
@@ -47,8 +47,6 @@ from animat.training.settings import SAC
 from animat.training.specification import CHUNKS
 
 
-@final
-@dataclass(frozen=True)
 class CulturePictures(StudyTask):
     """Draw the first recording and the series, and write their numbers to tables."""
 
@@ -82,7 +80,6 @@ class CulturePictures(StudyTask):
         return tables + _save(folder, "culture", figures, progress)
 
 
-@final
 @dataclass(frozen=True)
 class RobotPictures(StudyTask):
     """Draw learning, comparisons, returns over the recordings, controls, paths and frames of one robot."""

@@ -5,9 +5,8 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, final
+from typing import Any
 
 from animat.errors import counted
 from animat.evaluation.statistics import p_of_u
@@ -34,8 +33,6 @@ from animat.studies.task import StudyTask
 from animat.studies.toml import study_to_toml
 
 
-@final
-@dataclass(frozen=True)
 class Publish(StudyTask):
     """Write the report."""
 

@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any, final
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,12 +18,11 @@ from jaxtyping import Array
 
 from animat.compilation import jit_side_by_side
 from animat.environment import Environment
-from animat.errors import UnusableData
 from animat.evaluation.rollouts import Networks, roll_out
 from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import SimulatorTimeline, load_timeline, save_timeline
 from animat.progress import Progress
-from animat.studies.recording import fit_simulators, one_condition, read_series
+from animat.studies.recording import fit_simulators, read_series
 from animat.studies.specification import Study
 from animat.studies.task import StudyTask
 from animat.studies.training import training_of
@@ -46,8 +45,6 @@ def timeline_file(study: Study) -> Path:
     return Path("simulators") / f"{simulators.kind}{details and '-' + digest}.safetensors"
 
 
-@final
-@dataclass(frozen=True)
 class Fit(StudyTask):
     """Fit a simulator of the study's kind to the responses of each recording."""
 
@@ -55,8 +52,6 @@ class Fit(StudyTask):
 
     def make(self, folder: Path, progress: Progress) -> list[Path]:
         timeline = fit_simulators(self.study, read_series(self.study, folder))
-        if len(timeline.conditions) < 2:
-            raise UnusableData(one_condition(timeline))
         return [save_timeline(timeline, folder / timeline_file(self.study))]
 
 
@@ -123,7 +118,6 @@ class Trials(SideBySide):
         return Networks(network, scales, greedy)
 
 
-@final
 @dataclass(frozen=True)
 class TrainTrials(StudyTask):
     """Train trials of equal shape side by side, from one rung to the next, and evaluate them.
