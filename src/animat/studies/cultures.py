@@ -29,7 +29,7 @@ from animat.report.returns import draw_over_cultures
 from animat.report.style import save_formats
 from animat.studies.arms import arm_differences, arms_table, summarise_arms
 from animat.studies.folder import REPORT, RESULTS
-from animat.studies.results import read_typed, write_named_records, write_parquet, write_records
+from animat.studies.results import read_typed, write_of_cultures, write_parquet, write_records
 from animat.studies.run import StudyRun, run_study
 from animat.studies.source import read_seeds
 from animat.studies.specification import Compared, Study
@@ -109,10 +109,10 @@ def run_over_cultures(
         comparisons = {name: each.comparisons for name, each in results.items()}
         summary = tuple(over_cultures(list(comparisons.values())))
         scores = {name: each.scores for name, each in results.items()}
-        write_named_records(folder / COMPARISONS, comparisons, ComparedReturns, "culture")
+        write_of_cultures(folder / COMPARISONS, ComparedReturns, comparisons)
         write_records(folder / SUMMARY, OverCultures, summary)
-        write_named_records(folder / SCORES, scores, Score, "culture")
-        parquet = write_parquet((folder / SCORES).with_suffix(".parquet"), scores, Score, "culture")
+        write_of_cultures(folder / SCORES, Score, scores)
+        parquet = write_parquet((folder / SCORES).with_suffix(".parquet"), Score, scores)
     return CulturesRun(folder, finished, failed, comparisons, summary, parquet)
 
 

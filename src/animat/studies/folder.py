@@ -69,18 +69,14 @@ def hash_files(files: list[Path], base: Path) -> dict[str, str]:
     """SHA-256 of each file, by its path relative to `base`; CSV spikes include the file of their stimuli."""
     hashes: dict[str, str] = {}
     for file in files:
-        if _relative(file, base) in hashes:
-            raise InvalidArgument(f"culture.files: expected each file once, got {file} twice")
-        stimuli = stimuli_beside(file)
-        for each in [file] if stimuli is None else [file, stimuli]:
+        for each in filter(None, (file, stimuli_beside(file))):
+            # Relative where possible, so that a study and its files can be moved together.
+            name = (each.relative_to(base) if each.is_relative_to(base) else each).as_posix()
+            if name in hashes:
+                raise InvalidArgument(f"culture.files: expected each file once, got {each} twice")
             with as_invalid_file(each):
-                hashes[_relative(each, base)] = sha256(expect_plain_file(each))
+                hashes[name] = sha256(expect_plain_file(each))
     return dict(sorted(hashes.items()))
-
-
-def _relative(file: Path, base: Path) -> str:
-    """The path relative to `base` where possible, so that a study and its files can be moved together."""
-    return (file.relative_to(base) if file.is_relative_to(base) else file).as_posix()
 
 
 @contextmanager

@@ -279,5 +279,4 @@ def _curves(study: Study, folder: Path) -> Iterator[tuple[Any, ...]]:
         for arm in (arm for arm in study.arms if arm.trained):
             for i, curve in enumerate(learning_of(study, folder, spec, arm).tolist()):
                 for iterations, episodes, mean in curve:
-                    row = int(iterations), int(episodes), None if np.isnan(mean) else mean
-                    yield spec.name, arm.name, f"p{i}", *row
+                    yield spec.name, arm.name, f"p{i}", int(iterations), int(episodes), mean
