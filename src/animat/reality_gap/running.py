@@ -146,9 +146,6 @@ def run_policies(
     of_each = planned_episodes(len(policies), len(controls), episodes)
     check_session(culture, loop, agents, of_each, seed)
 
-    why_no_optimum = _why_no_optimum(loop, calibration)
-    if why_no_optimum is not None:
-        findings += (Finding("no-optimum", "note", why_no_optimum),)
     predicted = predict(
         trained,
         tuple(policies),
@@ -159,21 +156,13 @@ def run_policies(
         seed=seed,
         progress=in_phase(progress, "predicting"),
     )
-    optimum = None
-    if why_no_optimum is None:
-        # Before the session, as a loop must not wait for a core.
-        in_phase(progress, "optimal return").update(0, 1, "computing it on the simulator")
-        try:
-            # Only the value, which is reported as "about": its uncertainty would take a third longer.
-            values, _ = optimal_values([(animat, simulator)], grid_for(loop.robot).scaled(_RESOLUTION), seed=1)
-            optimum = float(values[0])
-        except Exception as error:
-            findings += (Finding("no-optimum", "note", f"no optimal return: {describe_error(error)}"),)
+    # Before the session, as a loop must not wait for a core.
+    optimum, why_none = _optimal_return(animat, calibration, progress)
     plan = [
         (n, predicted[each.name].presented, each.delivery != "silent") for n, each in zip(of_each, agents, strict=True)
     ]
     expected = outlook(loop, calibration, plan, account, culture.now_s / 60)
-    findings = (*noticed, *findings, *calibration.findings)
+    findings = (*noticed, *findings, *why_none, *calibration.findings)
     if report is not None:
         # Before the first pulse, so that the operator can still stop.
         for message in warnings_once(findings):
@@ -253,12 +242,24 @@ def planned_episodes(policies: int, controls: int, episodes: int) -> list[int]:
     return [episodes] * policies + [min(episodes, of_a_control)] * controls
 
 
-def _why_no_optimum(loop: Loop, calibration: Calibration) -> str | None:
-    """Why the optimal return cannot be computed; None if it can."""
-    reason = why_no_grid(loop.robot)
-    if few := too_few(loop.conditions, [len(responses) for responses in calibration.responses_hz]):
+def _optimal_return(
+    environment: Animat[Any], calibration: Calibration, progress: Progress | None
+) -> tuple[float | None, tuple[Finding, ...]]:
+    """The optimal return on the recording's simulator, or a finding that says why there is none."""
+    robot, reason = environment.robot, why_no_grid(environment.robot)
+    if few := too_few(calibration.conditions, [len(responses) for responses in calibration.responses_hz]):
         reason = f"these conditions have too few responses: {', '.join(few)}"
-    return None if reason is None else lacking(loop.robot).get("value_grid", f"no optimal return: {reason}")
+    if reason is None:
+        in_phase(progress, "optimal return").update(0, 1, "computing it on the simulator")
+        try:
+            # Only the value, which is reported as "about": its uncertainty would take a third longer.
+            case = environment, calibration.simulator
+            (value,), _ = optimal_values([case], grid_for(robot).scaled(_RESOLUTION), seed=1)
+            return float(value), ()
+        except Exception as error:
+            reason = describe_error(error)
+    message = lacking(robot).get("value_grid", f"no optimal return: {reason}")
+    return None, (Finding("no-optimum", "note", message),)
 
 
 def check_policies(policies: Mapping[str, Policy]) -> Policy:
