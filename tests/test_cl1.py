@@ -18,7 +18,7 @@ from animat.cultures.base import Culture
 from animat.cultures.contract import CultureContract
 from animat.cultures.devices.cl1 import CL1_LIMITS, CL1_PULSE, SITES, CL1Culture
 from animat.cultures.replay import ReplayCulture
-from animat.cultures.same_culture import other_culture
+from animat.cultures.same_culture import other_culture, other_patterns
 from animat.cultures.virtual import VirtualCulture
 from animat.errors import DeviceFailed, InvalidArgument, UnsafeStimulus
 from animat.recordings.formats.stimulus_text import parse_line
@@ -104,6 +104,25 @@ def test_another_chip_rig_or_kind_of_culture_is_reported(monkeypatch: pytest.Mon
     foreign = replace(recording, provenance={**recording.provenance, "chip_id": "A3"})
     with ReplayCulture([foreign]) as replayed:
         assert other_culture(recording, replayed) is None
+
+
+def test_other_patterns_than_the_recorded_ones_are_reported() -> None:
+    protocol = Protocol(pulse=CL1_PULSE, trials=2, patterns=2, setup_s=0.1)
+    (one, two, three) = pairs = [[1, 2], [3, 5], [9, 10]]
+    with CL1Culture(pairs[:2]) as culture:
+        recording = culture.record(protocol, seed=1)
+        assert other_patterns(recording, culture) is None
+    # The order of a pattern's electrodes, and of patterns, does not matter; nor do patterns that were not recorded.
+    with CL1Culture([three, two[::-1], one]) as culture:
+        assert other_patterns(recording, culture) is None
+    with CL1Culture(pairs[1:]) as culture:
+        found = other_patterns(recording, culture)
+        elsewhere = culture.record(protocol, seed=1)
+    assert found is not None and (found.name, found.value) == ("other-patterns", 1.0)
+    assert "1 of the 2 sets of electrodes that were stimulated in the recordings is not a pattern" in found.message
+    # A replay's patterns are those of its first recording, but it answers from all.
+    with ReplayCulture([recording, replace(elsewhere, start_min=10.0)]) as replayed:
+        assert other_patterns(elsewhere, replayed) is None
 
 
 def pulse(*numbers: float) -> Pulse:

@@ -15,6 +15,7 @@ from collections.abc import Callable
 from dataclasses import asdict, fields, is_dataclass
 from importlib.metadata import version
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import docstring_parser
@@ -33,17 +34,22 @@ from animat.evaluation.optimum import Optimum, best_return
 from animat.neurons.timeline import fit_timeline
 from animat.recordings.findings import Finding
 from animat.recordings.reading import read_recordings
+from animat.responses.condition import Condition
 from animat.responses.extraction import extract_series
-from animat.robots import Cartpole
+from animat.robots import Cartpole, robot_named
 from animat.training.policy import Policy
 from animat.training.settings import SAC
 from animat.watch.training import TrainingView
 from rig_files import event_table, mapping_table, spike_table, write_maxwell
 from synthetic_recordings import write_synthetic_series
-from test_evaluation import WITHOUT_NEURONS
+from test_evaluation import WITHOUT_NEURONS, policy_of
 
 pytestmark = pytest.mark.usefixtures("in_this_process")
 
+TWO_CONDITIONS: Any = SimpleNamespace(
+    conditions=(Condition("5 Hz", 5.0, "Hz"), Condition("80 Hz", 80.0, "Hz")), window_ms=(2.0, 10.0), presentation=None
+)
+PENDULUM = policy_of(TWO_CONDITIONS, robot_named("gymnasium:Pendulum-v1"))
 QUICK = ["--policies", "2", "--iterations", "1000"]
 
 
@@ -447,7 +453,7 @@ BAD = {
     "two protocols": (
         nothing,
         ["record", "--protocol", "{folder}/a.json", "--paper"],
-        ["animat: --protocol: expected it without --paper, which is another protocol; leave one out"],
+        ["animat: --protocol, --paper: expected one of them, as each is a protocol, got both"],
     ),
     "a file for the folder of figures": (
         lambda folder, *_: (folder / "taken").write_text("x"),
@@ -620,6 +626,19 @@ BAD = {
         ["train", "cartpole", "--mapping", "none", "--iterations", "6000", "--out", "{folder}"],
         ["expected a folder of this training, got one of another (training: [1] there, {{'"],
     ),
+    "a closed loop of policies without neurons": (
+        lambda folder, *_: WITHOUT_NEURONS.save(folder / "p0.safetensors"),
+        ["run", "{folder}", "--out", "{folder}/session"],
+        ["animat: policies: expected some that act through neurons, got some that were trained without"],
+    ),
+    **{
+        f"{option} for a robot stepped outside JAX": (
+            lambda folder, *_: PENDULUM.save(folder / "p0.safetensors"),
+            ["run", "{folder}", "--recordings", "{recordings}", *option.split(), "--out", "{folder}/session"],
+            [f"animat: {option}: expected a robot in JAX, got gymnasium:Pendulum-v1; leave it out"],
+        )
+        for option in ("--interventions", "--controls coupling")
+    },
     "recordings for policies without neurons": (
         lambda folder, *_: WITHOUT_NEURONS.save(folder / "p0.safetensors"),
         ["evaluate", "{folder}", "--recordings", "{recordings}"],
@@ -812,7 +831,11 @@ def test_an_error_of_an_argument_begins_with_its_option(
         (["convert", "a.csv", "--uot", "b.nwb"], 2, ["animat: unknown option --uot; did you mean --out?"]),
         (["--hepl"], 2, ["animat: unknown option --hepl; did you mean --help?"]),
         (["--versoin"], 2, ["animat: unknown option --versoin; did you mean --version?"]),
-        (["train", "cartpole", "pole"], 2, ["animat: unexpected argument 'pole'; see animat train --help"]),
+        (
+            ["train", "cartpole", "pole"],
+            2,
+            ["animat: unexpected argument 'pole'; recordings are named after --recordings; see animat train --help"],
+        ),
         (["train", "--robot", "pole"], 2, ["animat: robot: expected only its value, got --robot before it; see"]),
         (["train", "--seed=3", "--policies"], 2, ["animat: --policies: expected a value after it, got none; see"]),
         (["convert", "a.csv"], 2, ["animat: --out: expected a value, got none; see animat convert --help"]),

@@ -8,6 +8,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from pynwb import NWBHDF5IO
 
 from animat.cli import main
 from animat.errors import InvalidArgument, InvalidFile
@@ -330,4 +331,6 @@ def test_a_date_without_a_zone_is_taken_as_utc_with_a_note(date: str, is_noted: 
     with h5py.File(tmp_path / "out.nwb") as file:
         assert ("+00:00" in file["session_start_time"][()].decode()) == (is_noted or date.endswith("Z"))
     again = convert_recording(tmp_path / "out.nwb", tmp_path / "again.nwb")
+    with NWBHDF5IO(tmp_path / "again.nwb", "r") as io:
+        assert again.recorded_at == written.recorded_at == io.read().session_start_time
     assert [finding.name for finding in again.findings] == [finding.name for finding in written.findings]

@@ -182,6 +182,21 @@ def test_robot_parameters_and_mappings_are_options() -> None:
         gymnasium.make("Animat/Navigation-v0", episode_limit=20)
 
 
+def test_a_goal_replaces_the_task() -> None:
+    actions = np.random.default_rng(0).integers(0, 5, 300)
+    published = "avoid pole_angle outside -12..12 deg; avoid cart_position outside -0.5..0.5 m"
+    own, same = (
+        rollout(gymnasium.make("Animat/Cartpole-v0", **options), actions) for options in ({}, {"goal": published})
+    )
+    for one, another in zip(own[:4], same[:4], strict=True):
+        np.testing.assert_array_equal(one, another)
+    held = gymnasium.make("Animat/Navigation-v0", goal="drive x in 0..0.4 m")
+    observations, rewards, terminated, _, _ = rollout(held, actions)
+    assert 0 < rewards.sum() < 300 and not terminated.any()
+    x = [quantity.name for quantity in held.unwrapped.setup.environment.observation_spec].index("x")
+    np.testing.assert_array_equal(rewards, observations[:, x] <= np.float32(0.4))
+
+
 def test_a_simulator_decides_how_the_neurons_answer() -> None:
     env = gymnasium.make("Animat/Cartpole-v0", simulator=silenced(synthetic_simulator()), mapping="linear")
     infos = rollout(env, [0, 1, 2, 3, 4])[4]
@@ -235,6 +250,7 @@ def test_recordings_on_disk_are_the_neurons(tmp_path) -> None:
         ),
         ({"recordings": "missing", "conditions": "frequncy"}, "conditions: expected one of .*; got 'frequncy'"),
         ({"recordings": "r", "window_ms": (2, 4, 8)}, r"window_ms: expected two numbers .*, got \(2, 4, 8\)"),
+        ({"goal": "drive speed above 1"}, "goal: .*speed"),
         ({"neural_observation": 1}, "neural_observation: expected True or False, got 1"),
     ],
 )

@@ -213,6 +213,7 @@ def test_devices_are_recorded_by_the_same_calls(
     recordings = read_recordings(tmp_path)
     assert [r.start_min - zero_s / 60 for r in recordings] == pytest.approx([0, 0.5, 1.0], abs=0.01)
     dates = [datetime.fromisoformat(recording.provenance["recorded_at"]) for recording in recordings]
+    assert [recording.recorded_at for recording in recordings] == dates
     assert [began, *dates] == sorted([began, *dates]) and dates[-1] <= datetime.now(UTC)
     assert len(pulses_s()) == 3 * 10
 

@@ -132,7 +132,7 @@ def test_recordings_of_two_real_cultures_are_not_one_series(
     # Each is usable by itself, and it is said that the two do not belong together.
     assert main(["inspect", str(folder), "--json"]) == 1
     *printed, last = capsys.readouterr().out.splitlines()
-    assert "all together:" in printed and f"  !! {words}" in printed
+    assert "all together:" in printed and f"  refuse   several-cultures: {words}" in printed
     inspected = json.loads(last)
     assert [finding["name"] for finding in inspected["together"]] == ["several-cultures"]
     assert inspected["unusable"] == []

@@ -68,29 +68,30 @@ def test_a_session_takes_its_pauses_and_what_is_presented() -> None:
     plan = [(4, np.array([10.0, 80.0]), True), (2, np.array([10.0, 80.0]), False)]
     account = Account(Budget(pulses=188))
     account.pulses = 94
-    found = outlook(loop, calibration, plan, account, 15.0)
+    found = outlook(loop, calibration, plan, account, 5.0)
     # Stimulated episodes have 94 pulses, and a warm-up of two of each; in silence there is none.
     total_s = 4 * (3 + 12 / 5 + 82 / 80) + 2 * (3 + 10 / 5 + 80 / 80)
     assert found.planned_min == pytest.approx(total_s / 60)
     assert found.drifted_min == pytest.approx((-100 * math.log(0.75) - 5, -50 * math.log(0.75) - 5))
     # On a clock that was restarted no time is known to have passed.
-    for now_min in (0.0, 10.0):
-        restarted = outlook(loop, calibration, plan, account, now_min)
+    for age_min in (-10.0, 0.0):
+        restarted = outlook(loop, calibration, plan, account, age_min)
         assert restarted.drifted_min == pytest.approx((-100 * math.log(0.75), -50 * math.log(0.75)))
     assert found.budget_min == pytest.approx(total_s / 60 / 4)
     assert str(found).endswith("; the plan is longer: ask for fewer --episodes")
     assert "the plan is longer" not in str(replace(found, budget_min=math.inf))
     # Three more pauses before the first episode, with six of each.
-    longer = outlook(replace(loop, settling=3), calibration, plan, account, 15.0)
+    longer = outlook(replace(loop, settling=3), calibration, plan, account, 5.0)
     longer_s = total_s + 3 * (3 + 6 / 5 + 6 / 80)
     assert longer.planned_min == pytest.approx(longer_s / 60)
+    assert longer.settling_min == pytest.approx((longer_s - total_s) / 60) and found.settling_min == 0
     assert longer.budget_min == pytest.approx(longer_s / 60 * 94 / (4 * 94 + 36))
     # Of two pulses each, without a warm-up: 90 trials, and twelve in the settling.
-    twice = outlook(replace(loop, pulses=2, warm_up=0, settling=1), calibration, [(1, plan[0][1], True)], account, 15.0)
+    twice = outlook(replace(loop, pulses=2, warm_up=0, settling=1), calibration, [(1, plan[0][1], True)], account, 5.0)
     twice_s = 3 + 2 * (10 / 5 + 80 / 80) + 3 + 2 * (6 / 5 + 6 / 80)
     assert twice.planned_min == pytest.approx(twice_s / 60)
     assert twice.budget_min == pytest.approx(twice_s / 60 * 94 / (2 * 90 + 2 * 12))
-    assert outlook(loop, calibration, plan[1:], account, 15.0).budget_min == math.inf
+    assert outlook(loop, calibration, plan[1:], account, 5.0).budget_min == math.inf
 
 
 def test_the_outlook_is_one_line() -> None:
@@ -115,4 +116,8 @@ def test_the_outlook_is_one_line() -> None:
     assert str(Outlook(6.0, None, 7.0)) == (
         "the session is planned for about 6 min of the culture's time; at least two recordings are needed to estimate "
         "the culture's drift; the budget of pulses lasts for about 7 min"
+    )
+    # Fewer episodes would not help.
+    assert str(Outlook(6.0, None, 0.4, 1.5)).endswith(
+        "lasts for about 0 min, but the settling before the first episode takes 1.5 min (--settling)"
     )

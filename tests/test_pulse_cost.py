@@ -303,7 +303,7 @@ def test_a_cost_travels_with_policies(tmp_path: Path, responses: Responses) -> N
     assert whole.count(entry) == 2
     for other in (b"-9 ", b"NaN", b"[1]"):
         (tmp_path / "other.safetensors").write_bytes(whole.replace(entry, entry.replace(b"0.5", other)))
-        with pytest.raises(InvalidFile, match="got a faulty one: pulse_cost: expected"):
+        with pytest.raises(InvalidFile, match="this policy cannot be loaded: pulse_cost: expected"):
             Policy.load(tmp_path / "other.safetensors")
 
 

@@ -9,6 +9,7 @@ import shutil
 import signal
 import time
 from dataclasses import replace
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any, Literal
 
@@ -812,6 +813,29 @@ def test_a_recording_much_older_than_the_culture_is_reported(
     assert [row.name for row in gap.rows] == ["p0", "random"]
     found = [finding for finding in gap.findings if finding.name == "old-calibration"]
     assert [finding.value for finding in found] == ([pytest.approx(age_min)] if warned else [])
+
+
+@pytest.mark.usefixtures("few_bootstraps")
+def test_on_a_device_whose_clock_started_anew_a_recordings_date_tells_its_age(
+    tmp_path: Path, series: list[Responses]
+) -> None:
+    class Device(FakeCulture):
+        device = tmp_path / "device"
+
+    day_ago = datetime.now(UTC) - timedelta(hours=26)
+    dated = Calibration.of_series([replace(each, recorded_at=day_ago) for each in series])
+    with FakeCulture() as culture:
+        assert dated.age_min(culture) == pytest.approx(culture.now_s / 60 - dated.start_min)
+    with Device() as culture:
+        assert culture.now_s / 60 - dated.start_min <= 0 and dated.age_min(culture) == pytest.approx(26 * 60, abs=5)
+        assert Calibration.of_series(series).age_min(culture) <= 0
+        lines: list[str] = []
+        policies = {"p0": policy_of(0, series)}
+        gap = run_policies(
+            policies, culture, dated, tmp_path / "session", episodes=1, with_controls=False, report=lines.append
+        )
+    assert [f.value for f in gap.findings if f.name == "old-calibration"] == [pytest.approx(26 * 60, abs=5)]
+    assert any("from a recording made 26 h before this session: cultures drift" in line for line in lines)
 
 
 @pytest.mark.usefixtures("few_bootstraps")

@@ -287,7 +287,10 @@ BAD_NPZ: dict[str, tuple[dict[str, Any], str]] = {
     "a pulse without order": ({"presentation_pulses": 1}, "presentation_order: expected 'blocked' or 'mixed'"),
     "pulses without order": ({"presentation_pulses": 5}, "stimulus_presentation: required to know which 5"),
     "half a pulse": ({"presentation_pulses": 2.5}, "presentation_pulses: expected a whole number, got 2.5"),
-    "unknown order": ({"presentation_order": "shuffled"}, "order: expected 'blocked' or 'mixed', got 'shuffled'"),
+    "unknown order": (
+        {"presentation_order": "shuffled"},
+        "npz: presentation_order: expected 'blocked' or 'mixed', got 'shuffled'",
+    ),
     "order as a number": ({"presentation_order": 1}, "presentation_order: expected text, got 1"),
     "a rate as text": ({"sampling_rate_hz": "fast"}, "sampling_rate_hz: expected a number, got 'fast'"),
     "two rates": ({"sampling_rate_hz": np.ones(2)}, r"sampling_rate_hz: expected one value, got shape \(2,\)"),

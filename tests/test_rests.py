@@ -140,7 +140,7 @@ def test_a_protocol_of_rests_alone_is_recorded_with_a_warning(
         assert [line for line in said if line.startswith('warning: the only place is "none", so nothing is ever')]
     # What is made of it says so, and is refused.
     assert main(["inspect", str(tmp_path / "of none.json")]) == 1
-    assert "!! nothing was delivered: all 12 stimuli are rests" in capsys.readouterr().out
+    assert "  refuse   dead-window: nothing was delivered: all 12 stimuli are rests" in capsys.readouterr().out
     protocol = Protocol(places=("none", (1, 2)))
     assert not protocol.is_rest and not Protocol().is_rest and Protocol(places=("none",)).is_rest
 

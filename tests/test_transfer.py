@@ -168,4 +168,4 @@ def test_the_papers_setting_is_one_word(tmp_path: Path, capsys: pytest.CaptureFi
     assert [of["training"]["duration_min"] for of in (usual, paper)] == [20.0, 60.0]
 
     assert main(["record", "--paper", "--protocol", "x.json"]) == 1
-    assert "--protocol: expected it without --paper, which is another protocol" in capsys.readouterr().err
+    assert "--protocol, --paper: expected one of them, as each is a protocol, got both" in capsys.readouterr().err

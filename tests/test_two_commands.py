@@ -386,6 +386,8 @@ def test_the_command_line_reads_halves(tmp_path: Path, monkeypatch: pytest.Monke
     asked = ["--recordings", "recordings", "--episodes", "2"]
     assert main(["evaluate", *asked, "--optimum"]) == 0
     assert "expected one command for an optimal return" in capsys.readouterr().out
+    assert main(["inspect", "recordings", "--optimum", "arm"]) == 1
+    assert "animat: --optimum: arm: expected one command for an optimal return, got 2" in capsys.readouterr().err
     assert main(["run", *asked, "--culture", "replay"]) == 0
     assert main(["live", "my_wheels:Wheels"]) == 1
     assert "a live run reads all channels as one" in capsys.readouterr().err

@@ -243,5 +243,5 @@ def test_a_file_that_is_wrong_about_what_its_policy_sees_is_refused(seeing: Poli
     assert whole.count(field) == 2
     for other in (b"0   ", b"null", b"[5] "):
         (tmp_path / "other.safetensors").write_bytes(whole.replace(field, field.replace(b"true", other), 1))
-        with pytest.raises(InvalidFile, match=r"a complete, consistent policy, got a faulty one: (weights|neural)"):
+        with pytest.raises(InvalidFile, match=r"this policy cannot be loaded: (weights|neural)"):
             Policy.load(tmp_path / "other.safetensors")

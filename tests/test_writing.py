@@ -200,6 +200,6 @@ def test_a_leftover_that_cannot_be_removed_stays(tmp_path: Path, monkeypatch: py
 
 def test_a_folder_that_is_a_file_or_below_one_cannot_be_held(tmp_path: Path) -> None:
     (tmp_path / "a").write_text("")
-    for path, words in ((tmp_path / "a", "expected a folder, got a file"), (tmp_path / "a" / "b", "cannot be created")):
+    for path, words in ((tmp_path / "a", "expected a folder, got a file"), (tmp_path / "a" / "b", "a is not a folder")):
         with pytest.raises(InvalidFile, match=words), exclusive_lock(path):
             pass

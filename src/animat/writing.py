@@ -95,10 +95,10 @@ def exclusive_lock(folder: str | os.PathLike[str]) -> Iterator[None]:
         if folder.exists() and not folder.is_dir():
             raise InvalidFile(f"{folder}: expected a folder, got a file; choose another --out")
         created = [each for each in (folder, *folder.parents) if not each.exists()]
-        folder.mkdir(parents=True, exist_ok=True)
-        if not any(folder.iterdir()):
+        if created or not any(folder.iterdir()):
             # A folder with a finished run may be read-only; in an empty one nothing could be done.
             expect_writable(folder)
+        folder.mkdir(parents=True, exist_ok=True)
         descriptors = [os.open(folder, os.O_RDONLY)]
     try:
         if _is_locked(folder, descriptors[0]):

@@ -270,7 +270,8 @@ def _expect_known(unknown: Sequence[str], options: Mapping[str, Any], see: str) 
             raise InvalidArgument(f"{option[2:]}: expected only its value, got {argument} before it{see}") from None
         if argument.startswith("-"):
             raise InvalidArgument(f"unknown option {argument}{did_you_mean(option, options) or see}") from None
-        raise InvalidArgument(f"unexpected argument {argument!r}{see}") from None
+        hint = "; recordings are named after --recordings" if "--recordings" in options else ""
+        raise InvalidArgument(f"unexpected argument {argument!r}{hint}{see}") from None
 
 
 def _options() -> constructors.ConstructorRegistry:

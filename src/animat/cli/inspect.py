@@ -38,6 +38,7 @@ class Inspect(ResponseOptions):
     """Format of the figures"""
 
     def run(self) -> dict[str, Any]:
+        from animat.recordings.placing import placed_by_date
         from animat.recordings.reading import list_recordings, read_source
         from animat.report.inspection import draw_inspection, expect_unique_stems, finding_lines, inspection_text
         from animat.responses.bursts import check_threshold
@@ -45,11 +46,12 @@ class Inspect(ResponseOptions):
         from animat.responses.inspection import inspect_recording
         from animat.responses.quality.one_culture import series_findings, unlike_finding
         from animat.responses.windows import DEFAULT_WINDOW_MS, check_window
+        from animat.robots.grid import grid_for
         from animat.robots.registry import robot_named
 
         if self.optimum is not None:
             try:
-                robot_named(self.optimum)
+                grid_for(robot_named(self.optimum))
             except InvalidArgument as error:
                 raise InvalidArgument(f"--optimum: {str(error).removeprefix('robot: ')}") from error
         by = None if self.conditions is None else conditions_named(self.conditions)
@@ -94,29 +96,30 @@ class Inspect(ResponseOptions):
                 series.append((file, inspection.responses))
             unusable = [each["name"] for each in inspected if each["verdict"] == "not usable"]
             results: dict[str, Any] = {"recordings": inspected, "unreadable": unreadable, "unusable": unusable}
-            of_files = [responses for _, responses in series]
-            if together := [*unlike_finding(of_files), *series_findings(of_files)]:
+            of_files = placed_by_date([responses for _, responses in series])
+            placed = {finding for each in of_files for finding in each.findings if finding.name == "placed-by-date"}
+            if together := [*placed, *unlike_finding(of_files), *series_findings(of_files)]:
                 print("\n".join(["all together:", *finding_lines(together)]), end="\n\n")
             results["together"] = [{**finding.to_dict(), "value": finding.value} for finding in together]
             if self.out is not None and series:
                 progress.update(total - 1, total, "figures of the series")
-                results |= self._draw_series(series, self.out)
+                results |= self._draw_series([file for file, _ in series], of_files, self.out)
         if unreadable:
             others = "; the rest were inspected" if inspected else ""
             print(f"animat: {len(unreadable)} of {len(files)} files could not be inspected{others}", file=sys.stderr)
         return results
 
-    def _draw_series(self, series: Sequence[tuple[Path, Responses]], out: Path) -> dict[str, Any]:
+    def _draw_series(self, files: Sequence[Path], series: Sequence[Responses], out: Path) -> dict[str, Any]:
         """Draw the files' responses together, with the array of the first recording; returns the figures, if any."""
         from animat.recordings.reading import read_source
         from animat.recordings.recording import Recording
         from animat.report.inspection import draw_series
 
-        file, _ = min(series, key=lambda one: one[1].start_min)
+        file, _ = min(zip(files, series, strict=True), key=lambda one: one[1].start_min)
         first = read_source(file, stimuli=self.stimuli, part=self.part)
         recording = first if isinstance(first, Recording) else None
         try:
-            drawn = draw_series(recording, [responses for _, responses in series], out, self.format)
+            drawn = draw_series(recording, series, out, self.format)
         except Mismatch as unlike:
             print(f"no figures of the series: {unlike}")
             return {}

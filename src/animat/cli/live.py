@@ -83,8 +83,8 @@ class Live(StimulationOptions):
             raise InvalidArgument(f"--speed: expected 1, as a living culture runs in real time, got {self.speed:g}")
         if (self.culture == "replay") != bool(self.recordings):
             raise InvalidArgument(
-                f"--recordings: expected some for a replay and none for others, got {len(self.recordings)} for "
-                f"{self.culture}: a live run records the culture itself"
+                "--recordings: expected the recordings that a replay responds from, and none with another culture, got "
+                f"{len(self.recordings)} with --culture {self.culture}"
             )
         self._check_culture_seed()
         speed = (30.0 if simulated else 1.0) if self.speed is None else self.speed

@@ -70,7 +70,7 @@ class Record(FolderCommand):
                 raise InvalidArgument(f"{option}: expected {expected} for --culture {self.culture}, got {got}")
         options = [f"--{name}" for name in _PRESENTED if getattr(self, name) is not None]
         if self.protocol is not None and self.paper:
-            raise InvalidArgument("--protocol: expected it without --paper, which is another protocol; leave one out")
+            raise InvalidArgument("--protocol, --paper: expected one of them, as each is a protocol, got both")
         if options and self.protocol is not None:
             raise InvalidArgument(f"--protocol: expected it alone, got {', '.join(options)} too; put them in the file")
         protocol = self._protocol()

@@ -151,15 +151,16 @@ class Run(StimulationOptions):
                 "--recordings: expected those that the policies were trained on, got none: make some with "
                 "`animat record`, and train on them"
             )
-        if isinstance(first.robot, HostRobot) and (self.interventions or self.controls == "coupling"):
-            raise InvalidArgument(
-                f"--interventions, --controls coupling: expected a robot in JAX, got {first.robot.name}; leave them out"
-            )
+        in_jax = {"--interventions": self.interventions, "--controls coupling": self.controls == "coupling"}
+        for option in (option for option, is_given in in_jax.items() if is_given):
+            if isinstance(first.robot, HostRobot):
+                raise InvalidArgument(f"{option}: expected a robot in JAX, got {first.robot.name}; leave it out")
         return policies, first
 
     def _calibration(self, recordings: Sequence[Recording], first: Policy, fit: dict[str, Any]) -> Calibration:
         """The calibration by the recordings' responses, read by the options and otherwise as in the training."""
-        from animat.reality_gap import Calibration, check_conditions
+        from animat.evaluation.transfer import expect_conditions
+        from animat.reality_gap import Calibration
         from animat.responses.extraction import extract_series
 
         trained = first.fitted.get("burst_threshold")
@@ -173,7 +174,7 @@ class Run(StimulationOptions):
         )
         adaptive = self.thresholds == "adaptive"
         calibration = Calibration.of_series(series, first, at_min=self.at_min, adaptive=adaptive, **fit)
-        check_conditions(first, calibration)
+        expect_conditions(first, calibration.conditions, calibration.readouts)
         return calibration
 
     def _report(self, gap: RealityGap) -> None:

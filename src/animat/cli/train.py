@@ -220,7 +220,7 @@ _PAPER: dict[str, Any] = {"mapping": "1-threshold", "policies": 10, "share": 100
 
 
 def _random_return(training: Training, timeline: SimulatorTimeline | None) -> float | None:
-    """The mean return of random actions on the first simulator; None for a robot that is stepped on the host."""
+    """The mean return of random actions on the first simulator; None for a robot that is stepped outside JAX."""
     from animat.compilation import keep_compilations
     from animat.evaluation.rollouts import Uniform, roll_out
     from animat.robots.host import HostRobot

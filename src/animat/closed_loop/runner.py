@@ -85,7 +85,7 @@ class RobotRunner:
 
 
 class HostRunner:
-    """A robot that is stepped on the host, with its state; arguments and methods as for `RobotRunner` and `Bodies`."""
+    """A robot that is stepped outside JAX, with its state; arguments and methods as for `RobotRunner` and `Bodies`."""
 
     def __init__(self, robot: Robot[Any], rng: np.random.Generator, *, with_pictures: bool = False) -> None:
         assert isinstance(robot, HostRobot)

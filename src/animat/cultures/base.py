@@ -231,11 +231,12 @@ class Culture(Openable):
         """
         schedule, progress = self.schedule(protocol, seed), progress or Silent()
         provenance = {**self.provenance, "protocol_seed": str(seed)}
-        if self.device is not None:
-            # Others are the same whenever they are made.
-            provenance["recorded_at"] = datetime.now(UTC).isoformat(timespec="seconds")
+        # Other recordings are the same whenever they are made.
+        date = None if self.device is None else datetime.now(UTC).replace(microsecond=0)
+        if date is not None:
+            provenance["recorded_at"] = date.isoformat()
         self._rehearse(schedule)
-        about = {"channels": self.channels, "culture": self.recorded_as, "provenance": provenance}
+        about = {"channels": self.channels, "culture": self.recorded_as, "provenance": provenance, "recorded_at": date}
         start_min, rate_hz, before = self.now_s / 60, self.sampling_rate_hz, self.left_out
         parts, observed = list[Block](), list[Observed]()
 

@@ -76,8 +76,11 @@ def other_channels(recording: Recording, culture: Culture) -> Finding | None:
 def other_patterns(recording: Recording, culture: Culture) -> Finding | None:
     """A warning where electrodes were stimulated together that are not a pattern of this open culture; else None.
 
-    A policy was trained on responses to the recorded patterns. The same culture responds differently to others.
+    A policy was trained on responses to the recorded patterns. The same culture responds differently to others; a
+    replay, whose patterns are those of its first recording, answers to all from its recordings.
     """
+    if culture.name == "replay":
+        return None
     tables = recording.stimuli.electrodes, culture.patterns
     recorded, patterns = ({frozenset(row) - {UNKNOWN} for row in table.tolist()} for table in tables)
     strange = recorded - patterns - {frozenset()}

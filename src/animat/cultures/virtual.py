@@ -195,8 +195,8 @@ class VirtualCulture(ComputedCulture):
         state = read_state(path, self.settings, tissue)
         if self._selection is not None and self._selection.to_dict() != state.selection.to_dict():
             raise Mismatch(
-                f"{path}: expected the state of this culture, got another's, which differs in selection: remove it to "
-                "start again, or use the same electrodes"
+                f"{path}: expected the state of this culture, got another's, which differs in selection: use the same "
+                "electrodes, or start another culture in another folder"
             )
         # Only now: a failed restore leaves the culture unchanged.
         self._tissue, self._visibility = tissue, visibility

@@ -68,9 +68,9 @@ def read_state(path: Path, settings: Mapping[str, str], tissue: Tissue) -> Virtu
             raise InvalidArgument(f"format {shown(head['format'])}")
         for name, value in settings.items():
             if head["culture"].get(name) != value:
-                remedy = "remove it to start again, or use the same settings"
+                remedy = "use the same settings, or start another culture in another folder"
                 if name == "tissue_revision":
-                    remedy = "continue with the version of animat that wrote it, or remove it to start again"
+                    remedy = "continue with the version of animat that wrote it, or start again in another folder"
                 raise Mismatch(
                     f"{path}: expected the state of this culture, got another's, which differs in {name}: {remedy}"
                 )

@@ -92,7 +92,8 @@ def controls_of(
     for i, label in enumerate(labels):
         controls.append(Control(f"constant {label}", "always this one", Constant(jnp.array([i]))))
     if hasattr(environment.robot, "heuristic"):
-        action = "the command" if environment.n_actions is None else "the stimulus nearest to the command"
+        chosen = "stimulus" if isinstance(wrappers.unwrapped(environment), Animat) else "action"
+        action = "the command" if environment.n_actions is None else f"the {chosen} nearest to the command"
         meaning = f"no learning: {action} of the robot's heuristic"
         controls.append(Control("heuristic", meaning, heuristic_policy(environment, simulator)))
     if policies is not None and isinstance(wrappers.unwrapped(environment), Animat):

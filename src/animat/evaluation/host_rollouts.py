@@ -1,4 +1,4 @@
-"""Episodes with bodies that are stepped on the host; actors and neurons are compiled."""
+"""Episodes with bodies that are stepped outside JAX; actors and neurons are compiled."""
 
 from __future__ import annotations
 

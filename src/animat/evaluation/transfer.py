@@ -86,13 +86,13 @@ def other_culture(trained: RecordedCulture | None, given: RecordedCulture | None
         yield Finding("other-culture", "warning", message)
 
 
-def old_calibration(recorded_at_min: float, culture_min: float) -> Iterator[Finding]:
-    """A warning if the predicting recording is old at the time of the culture or its newest recording."""
-    age_min = culture_min - recorded_at_min
+def old_calibration(age_min: float, now: str) -> Iterator[Finding]:
+    """A warning if the predicting recording was made long before another one, or a session."""
     if age_min > OLD_MIN:
+        age = f"{age_min:.0f} min" if age_min < 600 else f"{age_min / 60:.0f} h"
         message = (
-            f"percentiles and prediction are from {recorded_at_min:.0f} min, but the culture is at {culture_min:.0f} "
-            "min: cultures drift; use a later recording (--at-min), or train on later ones"
+            f"percentiles and prediction are from a recording made {age} before {now}: cultures drift; use a later "
+            "recording (--at-min), or train on later ones"
         )
         yield Finding("old-calibration", "warning", message, age_min)
 
@@ -154,7 +154,7 @@ def loop_differences(policy: Policy, timeline: SimulatorTimeline, minute: float)
     recorded = policy.presentation
     yield from other_presentation(recorded, Presentation("mixed", 1 if recorded is None else recorded.pulses))
     yield from other_calibration(recorded, timeline.presentation)
-    yield from old_calibration(minute, float(timeline.start_min[-1]))
+    yield from old_calibration(float(timeline.start_min[-1]) - minute, "the last one")
     has_memory = timeline.simulators.has_memory
     yield from no_memory(timeline.findings_at(minute), timeline.presentation, has_memory=has_memory)
     trained_until = policy.trained_until_min(float(timeline.start_min[0]))

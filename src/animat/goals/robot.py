@@ -51,7 +51,7 @@ class RobotWithGoal(Robot[GoalState]):
     with m_i the margin in [-1, 1]: how far inside the region the robot is, in scales of the quantity.
 
     Raises:
-        InvalidArgument: for a robot that is stepped on the host or already has a goal, and for a goal with quantities
+        InvalidArgument: for a robot that is stepped outside JAX or already has a goal, and for a goal with quantities
             or units that the robot does not observe, or with an empty region.
     """
 
@@ -64,8 +64,8 @@ class RobotWithGoal(Robot[GoalState]):
             raise InvalidArgument(f"robot: expected a robot without a goal, got {shown(robot)}")
         if isinstance(robot, HostRobot):
             raise InvalidArgument(
-                f"goal: expected a robot that is stepped in JAX, got {robot.name}, which is stepped on the host and "
-                "has its own reward"
+                f"goal: expected a robot that is stepped in JAX, got {robot.name}, which is stepped outside JAX "
+                "and has its own reward"
             )
         if not isinstance(self.goal, Goal):
             raise InvalidArgument(f"goal: expected a Goal, or a string for with_goal, got {shown(self.goal)}")

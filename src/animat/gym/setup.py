@@ -17,6 +17,8 @@ from animat.coding.decoder import expect_fit
 from animat.coding.mapping import Mapping, mapping_named
 from animat.environment import Animat, Environment
 from animat.errors import InvalidArgument, expect_kind, expect_several
+from animat.goals.goal import Goal
+from animat.goals.robot import with_goal
 from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.synthetic import LABELS, synthetic_simulator
 from animat.neurons.timeline import Kind, fit_timeline
@@ -59,6 +61,7 @@ class Setup:
 def set_up(
     robot: str,
     *,
+    goal: str | Goal | None = None,
     mapping: str | Mapping = "1-threshold",
     recordings: Paths | None = None,
     simulator: NeuronSimulator | None = None,
@@ -75,6 +78,7 @@ def set_up(
 
     Args:
         robot: its name, or where to import it from (`robot_named`); set by the environment's id except for `Robot-v0`.
+        goal: that replaces the robot's own task, as text or a `Goal` (`animat.with_goal`).
         mapping: from a response to a motor command, or its name: `1-threshold`, `9-thresholds`, `linear`, or your own,
             which may also be named by where to import it from.
         recordings: files or folders of recordings of one culture, to which the neuron simulator is fitted.
@@ -108,6 +112,8 @@ def set_up(
         )
     if not is_ours(body):
         check_robot(body)
+    if goal is not None:
+        body = with_goal(body, goal)
     for caveat in body.caveats():
         warnings.warn(caveat, stacklevel=2)
     expect_kind("simulator", simulator, NeuronSimulator | None, "a simulator; `kind` takes the name of one")

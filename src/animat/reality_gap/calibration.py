@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 from typing import Any, Self
 
 import numpy as np
@@ -12,6 +13,7 @@ from jaxtyping import Float64
 from animat.arguments import checked_arguments
 from animat.closed_loop.adaptive import AdaptiveThresholds, kept_counts
 from animat.coding.mapping import Thresholds
+from animat.cultures.base import Culture
 from animat.neurons.history import Ranked
 from animat.neurons.history_tracker import AdjustedRanks, HistoryState, HistoryTracker
 from animat.neurons.memory import MemorySimulator
@@ -46,7 +48,7 @@ class Calibration:
         start_min: of the recording on the culture's clock.
         fitted: how the simulators were fitted, as in `Policy.fitted`.
         adjusted: its responses, from which adaptive thresholds start.
-        culture: that was recorded; None if it is not known.
+        culture, recorded_at: which was recorded, and when; None if it is not known.
     """
 
     __repr__ = briefly
@@ -66,11 +68,18 @@ class Calibration:
     adjusted: AdjustedRanks
     readouts: Readouts = ALL
     culture: RecordedCulture | None = None
+    recorded_at: datetime | None = None
 
     @property
     def responses_hz(self) -> tuple[Float64[np.ndarray, "responses *readouts"], ...]:
         """Non-burst responses of each condition, in order of time, shape (responses,), or (responses, readouts)."""
         return self.adjusted.responses_hz
+
+    def age_min(self, culture: Culture) -> float:
+        """How old the recording is: on a device by the computer's clock, if known, as the device's may start anew."""
+        if culture.device is not None and self.recorded_at is not None:
+            return (datetime.now(UTC) - self.recorded_at).total_seconds() / 60
+        return culture.now_s / 60 - self.start_min
 
     @property
     def remembering(self) -> HistoryTracker:
@@ -140,6 +149,7 @@ class Calibration:
             readouts=timeline.readouts,
             adjusted=adjusted,
             culture=timeline.culture,
+            recorded_at=responses.recorded_at,
         )
         if adaptive or policy is None or policy.percentiles != "first":
             return calibration

@@ -26,11 +26,13 @@ class Outlook:
         drifted_min: time until the recordings' drift has changed P50 by a quarter since the last of them, and a lower
             bound of it; None if the recordings do not determine the drift.
         budget_min: time until the budget of pulses is spent; infinite without one.
+        settling_min: of the planned time, what passes before the first episode.
     """
 
     planned_min: float
     drifted_min: tuple[float, float] | None
     budget_min: float
+    settling_min: float = 0.0
 
     @property
     def room_bytes(self) -> float:
@@ -55,6 +57,8 @@ class Outlook:
         if np.isfinite(self.budget_min):
             text += f"; the budget of pulses lasts for about {self.budget_min:.0f} min"
         text += remedy
+        if self.budget_min < self.settling_min:
+            return f"{text}, but the settling before the first episode takes {self.settling_min:.1f} min (--settling)"
         return text + ("; the plan is longer: ask for fewer --episodes" if self.planned_min > available_min else "")
 
 
@@ -67,9 +71,9 @@ def outlook(
     calibration: Calibration,
     episodes: Sequence[tuple[int, Float64[np.ndarray, " conditions"], bool]],
     account: Account,
-    now_min: float,
+    age_min: float,
 ) -> Outlook:
-    """How long a session will be and can be from `now_min` of the culture's clock on.
+    """How long a session will be and can be, that much later than the recording.
 
     `episodes` has for each agent the number of episodes, how often each condition is presented in one of them, and
     whether the culture gets pulses.
@@ -82,12 +86,14 @@ def outlook(
         total_s += n * (loop.pause_s + float(presented @ interval_s))
         pulses += n * is_stimulated * loop.pulses * float(presented[gives].sum())
     settling = loop.settling or 0
-    total_s += settling * (loop.pause_s + SETTLING_ROUNDS * float(interval_s.sum()))
+    settling_s = settling * (loop.pause_s + SETTLING_ROUNDS * float(interval_s.sum()))
+    total_s += settling_s
     pulses += settling * SETTLING_ROUNDS * loop.pulses * int(gives.sum())
-    # A clock before the recording was restarted (a MaxOne's starts with each program): its age is not known.
-    of, drift, since_min = account.budget.pulses, calibration.drift, min(0.0, calibration.start_min - now_min)
+    # On a clock that was restarted, the age is not known.
+    of, drift, since_min = account.budget.pulses, calibration.drift, min(0.0, -age_min)
     return Outlook(
         total_s / 60,
         None if drift is None else tuple(since_min + each for each in drift.minutes_to(LARGE)),  # type: ignore[arg-type]
         np.inf if of is None or pulses == 0 else total_s / 60 * (of - account.pulses) / pulses,
+        settling_s / 60,
     )

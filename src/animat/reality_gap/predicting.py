@@ -26,7 +26,7 @@ EPISODES = 200
 ROLL_OUTS = 5
 """Roll-outs on the recording's simulator; there is one on each bootstrap simulator."""
 BOOTSTRAPS_ON_HOST = 40
-"""Bootstraps for a robot that is stepped on the host: fewer, as an episode takes a thousand times as long."""
+"""Bootstraps for a robot that is stepped outside JAX: fewer, as an episode takes a thousand times as long."""
 
 
 class Prediction(NamedTuple):

@@ -20,7 +20,7 @@ from animat.cultures.base import Culture
 from animat.cultures.budget import Account
 from animat.cultures.failures import describe_error
 from animat.environment import Animat, Environment
-from animat.errors import InvalidArgument
+from animat.errors import InvalidArgument, UnusableData
 from animat.evaluation import transfer
 from animat.evaluation.controls import RANDOM, Control, controls_of, coupling_of, interventions_of
 from animat.evaluation.optimal_returns import too_few
@@ -100,7 +100,7 @@ def run_policies(
         UnusableData: for policies without neurons.
     """
     first = check_policies(policies)
-    check_conditions(first, calibration)
+    transfer.expect_conditions(first, calibration.conditions, calibration.readouts)
     settings = {"burst_threshold": calibration.burst_threshold, **settings}
     if calibration.adaptive:
         settings["adaptive_from"] = calibration.adjusted
@@ -109,7 +109,8 @@ def run_policies(
     if first.neural_observation:
         settings["remembering"] = calibration.remembering
     loop, findings = Loop.of_policy(first, calibration.percentiles, pulses=pulses, **settings)
-    findings += tuple(_warnings(first, loop, calibration, culture.now_s / 60))
+    age_min = calibration.age_min(culture)
+    findings += tuple(_warnings(first, loop, calibration, age_min))
     account = account or Account()
     animat = Animat(loop.robot, loop.mapping, len(loop.conditions))
     environment: Environment[Any] = NeuralObservation(animat) if first.neural_observation else animat
@@ -131,7 +132,7 @@ def run_policies(
     if with_interventions:
         if isinstance(loop.robot, HostRobot):
             raise InvalidArgument(
-                f"--interventions: expected a robot in JAX, got {loop.robot.name}, which is stepped on the host"
+                f"--interventions: expected a robot in JAX, got {loop.robot.name}, which is stepped outside JAX"
             )
         simulated = {"episodes": INTERVENTION_EPISODES, "seed": seed}
         half_way = trained.run(environment, simulator, **simulated).half_way
@@ -161,7 +162,7 @@ def run_policies(
     plan = [
         (n, predicted[each.name].presented, each.delivery != "silent") for n, each in zip(of_each, agents, strict=True)
     ]
-    expected = outlook(loop, calibration, plan, account, culture.now_s / 60)
+    expected = outlook(loop, calibration, plan, account, age_min)
     findings = (*noticed, *findings, *why_none, *calibration.findings)
     if report is not None:
         # Before the first pulse, so that the operator can still stop.
@@ -201,7 +202,7 @@ def run_policies(
     )
 
 
-def _warnings(first: Policy, loop: Loop, calibration: Calibration, now_min: float) -> Iterator[Finding]:
+def _warnings(first: Policy, loop: Loop, calibration: Calibration, age_min: float) -> Iterator[Finding]:
     """Known reasons why the measured return may differ from the prediction."""
     yield from transfer.other_calibration(first.presentation, calibration.presentation)
     if first.delivery == "shuffled":
@@ -225,12 +226,12 @@ def _warnings(first: Policy, loop: Loop, calibration: Calibration, now_min: floa
         yield Finding("moving-percentiles", "warning", message)
     yield from transfer.other_simulator(first.fitted, calibration.fitted)
     yield from transfer.other_culture(first.culture, calibration.culture)
-    yield from transfer.old_calibration(calibration.start_min, now_min)
+    yield from transfer.old_calibration(age_min, "this session")
     yield from transfer.no_memory(calibration.findings, calibration.presentation, has_memory=has_memory)
     if isinstance(loop.robot, HostRobot):
         episodes_predicted = ROLL_OUTS * episodes_on_host(loop.robot)
         message = (
-            f"{loop.robot.name} is stepped on the host: predicted returns are from {episodes_predicted} episodes, and "
+            f"{loop.robot.name} is stepped outside JAX: predicted returns are from {episodes_predicted} episodes, and "
             f"their intervals from {BOOTSTRAPS_ON_HOST} bootstraps"
         )
         yield Finding("few-predicted", "note", message)
@@ -265,16 +266,14 @@ def _optimal_return(
 def check_policies(policies: Mapping[str, Policy]) -> Policy:
     """The first of policies that can take turns in one closed loop, which represents all.
 
-    Raises InvalidArgument for no policies, and Mismatch if they differ in more than in their networks.
+    Raises InvalidArgument for no policies, Mismatch if they differ in more than in their networks, and UnusableData for
+    policies without neurons.
     """
     alike = ("robot", "mapping", "readouts", "conditions", "commands", "presentation", "window_ms", "fitted")
-    return first_of_alike(policies, (*alike, "percentiles", "delivery", "pulse_cost"), "run it alone")
-
-
-def check_conditions(first: Policy, calibration: Calibration) -> None:
-    """Raise Mismatch unless a calibration has the policies' conditions and readouts."""
-    if first.mapping is not None:
-        transfer.expect_conditions(first, calibration.conditions, calibration.readouts)
+    first = first_of_alike(policies, (*alike, "percentiles", "delivery", "pulse_cost"), "run it alone")
+    if first.mapping is None:
+        raise UnusableData("policies: expected some that act through neurons, got some that were trained without")
+    return first
 
 
 def _rows(

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from animat.errors import UnusableData
+from animat.errors import InvalidArgument, UnusableData
 from animat.recordings.findings import Finding, merged
-from animat.recordings.metadata import culture_of
+from animat.recordings.metadata import culture_of, date_of
 from animat.recordings.recording import Channels, Recording
 from animat.recordings.time_quality import late_start
 from animat.stimulation.protocol import Presentation
@@ -82,7 +82,10 @@ class PlainColumns:
             if pulses is None:
                 per_trial = np.unique(stimuli.presentation, return_counts=True)[1]
                 pulses = max(1, int(np.bincount(per_trial, minlength=1).argmax()))
-            presentation = Presentation(self.presentation_order, pulses)  # type: ignore[arg-type]
+            try:
+                presentation = Presentation(self.presentation_order, pulses)  # type: ignore[arg-type]
+            except InvalidArgument as error:
+                raise UnusableData(f"presentation_{error}") from error
         elif self.presentation_pulses is not None:
             raise UnusableData("presentation_order: expected 'blocked' or 'mixed' with presentation_pulses, got none")
         return Recording(
@@ -97,6 +100,7 @@ class PlainColumns:
             presentation=presentation,
             provenance={**provenance, **names},
             culture=culture_of(provenance),
+            recorded_at=date_of(provenance),
             findings=merged(noted),
         )
 

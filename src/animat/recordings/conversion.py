@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from animat.recordings.findings import Finding, merged
 from animat.recordings.formats.hdf5_formats import open_traces
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.formats.with_spikeinterface import open_with_spikeinterface
-from animat.recordings.metadata import culture_of
+from animat.recordings.metadata import culture_of, date_of
 from animat.recordings.raw import RawTraces
 from animat.recordings.reading import HDF5, TEXT_NAMES, ZIP, first_bytes, read_recording
 from animat.recordings.recording import Recording
@@ -138,7 +139,8 @@ def convert_recording(
     default = {"sex": "U"} if "subject_id" in given else {}
     start_min = recording.start_min if start_min is None else start_min
     provenance = {**default, **recording.provenance, **given}
-    recording = replace(recording, provenance=provenance, culture=culture_of(provenance), start_min=float(start_min))
+    read: dict[str, Any] = {"culture": culture_of(provenance), "recorded_at": date_of(provenance)}
+    recording = replace(recording, provenance=provenance, start_min=float(start_min), **read)
     recording = replace(recording, findings=(*recording.findings, *_without_zone(recording)))
     write_nwb(recording, out)
     return recording

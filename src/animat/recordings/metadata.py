@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import replace
+from datetime import UTC, datetime
 from typing import Any, get_args
 
 from animat.errors import InvalidArgument
@@ -34,7 +35,7 @@ def to_metadata(recording: Recording) -> dict[str, str]:
 
 
 def from_metadata(metadata: Mapping[str, str]) -> dict[str, Any]:
-    """A recording's `provenance`, `protocol`, `culture` and `findings`; refuses what is no protocol or no number."""
+    """Fields of a recording, from its `provenance` to its date; refuses what is no protocol or no number."""
     provenance, findings, protocol = dict[str, str](), list[Finding](), None
     values = read_record(dict[str, float], json_data(metadata.get(_VALUES, "{}"), _VALUES), _VALUES)
     for key, text in metadata.items():
@@ -45,8 +46,8 @@ def from_metadata(metadata: Mapping[str, str]) -> dict[str, Any]:
             findings.append(Finding(name, severity, text, values.get(key)))  # type: ignore[arg-type]
         elif key != _VALUES:
             provenance[key] = text
-    culture = culture_of(metadata)
-    return {"provenance": provenance, "protocol": protocol, "culture": culture, "findings": tuple(findings)}
+    origin = {"culture": culture_of(metadata), "recorded_at": date_of(metadata)}
+    return {"provenance": provenance, "protocol": protocol, "findings": tuple(findings), **origin}
 
 
 def _nameless(culture: RecordedCulture | None) -> RecordedCulture | None:
@@ -82,3 +83,12 @@ def culture_of(metadata: Mapping[str, str]) -> RecordedCulture | None:
             if known is not None or _OURS in source:
                 return RecordedCulture(kind, known, kind == "cl1" and "simulator" in source, names)
     return RecordedCulture(names=names) if names else None
+
+
+def date_of(metadata: Mapping[str, str]) -> datetime | None:
+    """When a recording began, as its provenance states it, or None; a date without a time zone is taken as UTC."""
+    try:
+        date = datetime.fromisoformat(metadata.get("recorded_at", ""))
+    except ValueError:
+        return None
+    return date if date.tzinfo else date.replace(tzinfo=UTC)

@@ -21,6 +21,7 @@ from animat.recordings.formats.npz import read_npz
 from animat.recordings.formats.response_files import read_response_npz, read_response_table
 from animat.recordings.formats.text_table import GZIP, read_table
 from animat.recordings.hdf5_subprocess import read_hdf5_in_subprocess
+from animat.recordings.placing import placed_by_date
 from animat.recordings.recording import Recording, ResponseTable
 
 S = TypeVar("S", Recording, Recording | ResponseTable)
@@ -138,11 +139,14 @@ def _read_text(path: Path, begin: bytes, stimuli_path: str | os.PathLike[str] | 
 def read_recordings(paths: str | os.PathLike[str] | Iterable[str | os.PathLike[str]]) -> list[Recording]:
     """Read recordings from files and folders, in the order of the culture's clock.
 
+    If some start at the same minute, as rigs' files state none, all are placed by their dates (`placed_by_date`).
+
     Args:
         paths: one or more files, or folders with `*.nwb`, `*.h5`, `*.npz`, `*_spikes.csv` or `*_spikes.csv.gz`.
 
     Raises:
-        InvalidFile: for a file that cannot be read, a folder without recordings, or two recordings with the same start.
+        InvalidFile: for a file that cannot be read, a folder without recordings, or two recordings with the same start
+            and no dates.
         InvalidArgument: if no path is given.
     """
     return _in_order(list_recordings(paths), read_recording)
@@ -154,12 +158,14 @@ def read_sources(paths: str | os.PathLike[str] | Iterable[str | os.PathLike[str]
 
 
 def _in_order(files: list[Path], read_one: Callable[[Path], S]) -> list[S]:
-    read = sorted(((read_one(file), file) for file in files), key=lambda pair: pair[0].start_min)
+    placed = placed_by_date([read_one(file) for file in files])
+    read = sorted(zip(placed, files, strict=True), key=lambda pair: pair[0].start_min)
     for (earlier, file), (later, other) in pairwise(read):
         if earlier.start_min == later.start_min:
             raise InvalidFile(
                 f"{other}: expected recordings with different starts, but this one and {file} both start at "
-                f"{later.start_min:g} min; leave one out, or change its start (animat convert --start-min)"
+                f"{later.start_min:g} min; leave one out, or convert all with their dates (animat convert "
+                "--recorded-at) or starts (--start-min)"
             )
     return [recording for recording, _ in read]
 

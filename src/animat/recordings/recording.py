@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
+from datetime import datetime
 from types import MappingProxyType
 from typing import Any, ClassVar, Literal
 
@@ -90,6 +91,7 @@ class Recording:
         protocol: with which it was recorded, None if not known.
         culture: that was recorded, None if not known.
         findings: made when the recording was read or its spikes were detected.
+        recorded_at: when it began, with a time zone; None if not known.
 
     Raises:
         UnusableData: for times that are not finite or not in ascending order, or rows outside the tables.
@@ -110,6 +112,7 @@ class Recording:
     protocol: Protocol | None = None
     culture: RecordedCulture | None = None
     findings: tuple[Finding, ...] = ()
+    recorded_at: datetime | None = None
 
     def __post_init__(self) -> None:
         freeze(self, "spikes", spike_times_s=np.float64, spike_channels=np.int64)
@@ -170,7 +173,7 @@ class ResponseTable:
         has_times: whether `stimuli.time_s` are times; otherwise they number the rows.
         window_ms: the window after the stimulus in which spikes were counted, None if not known.
         start_min, presentation, provenance, findings: as in `Recording`.
-        protocol, culture: None, as files do not state them.
+        protocol, culture, recorded_at: None, as files do not state them.
 
     Raises:
         UnusableData: for values that are negative or not finite, counts that are not whole, or tables of the wrong
@@ -189,6 +192,7 @@ class ResponseTable:
     findings: tuple[Finding, ...] = ()
     protocol: ClassVar[None] = None
     culture: ClassVar[None] = None
+    recorded_at: ClassVar[None] = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "provenance", MappingProxyType(dict(self.provenance)))

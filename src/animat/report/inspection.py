@@ -23,7 +23,6 @@ from animat.responses.psth import PostStimulusHistogram, post_stimulus_histogram
 from animat.responses.responses import Responses
 
 _MOST_CONDITIONS = 16
-_MARK = {"refuse": "!!", "warning": "! ", "note": "- "}
 
 
 def inspection_text(inspection: Inspection) -> str:
@@ -62,8 +61,8 @@ def inspection_text(inspection: Inspection) -> str:
 
 
 def finding_lines(findings: Sequence[Finding]) -> list[str]:
-    """A line for each finding, with a mark for its severity."""
-    return [f"  {_MARK[finding.severity]} {finding.message}" for finding in findings]
+    """A line for each finding: its severity, its name and what was found."""
+    return [f"  {finding.severity:<7}  {finding.name}: {finding.message}" for finding in findings]
 
 
 def _spontaneous(inspection: Inspection, bursts: NetworkBursts) -> list[str]:

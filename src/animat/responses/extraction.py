@@ -124,6 +124,7 @@ def extract_responses(
         separability=bursts.separability,
         presentation=source.presentation,
         start_min=source.start_min,
+        recorded_at=source.recorded_at,
         time_s=None if time_s is None else time_s[chosen],
         presented=Trials(condition, rate_hz, active_ratio > bursts.threshold, is_rested, time_s),
         place=np.flatnonzero(chosen),

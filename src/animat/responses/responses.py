@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from datetime import datetime
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -67,7 +68,7 @@ class Responses:
         place: the index of each response among them, shape (responses,).
         by: the rule that sorted stimuli into conditions, as `conditions_named` reads it; None if it is not known.
         burst_threshold: the given threshold; None: it is Otsu's.
-        culture: that was recorded; None if it is not known.
+        culture, recorded_at: which was recorded, and when; None if it is not known.
         channels: those over which x is a mean; None if they are not known.
         readouts: the groups of channels read; by default all channels as one.
         readout_hz: x of each readout, shape (responses, readouts), or (responses,) for one; None: it is `rate_hz`.
@@ -97,6 +98,7 @@ class Responses:
     by: str | None = None
     burst_threshold: float | None = None
     culture: RecordedCulture | None = None
+    recorded_at: datetime | None = None
     channels: Channels | None = None
     readouts: Readouts = ALL
     readout_hz: Float64[np.ndarray, "responses *readouts"] | None = None

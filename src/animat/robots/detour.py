@@ -28,7 +28,7 @@ _POSTS = tuple((x, y, 0.015) for x1, y1, x2, y2 in _SCREENS for x, y in ((x1, y1
 @register_robot
 @record
 class Detour(Wheels):
-    """The same robot (`Wheels`) in an arena where the straight path from the start to the goal is always blocked.
+    """The two-wheeled robot in an arena where the straight path from the start to the goal is always blocked.
 
     A goal is drawn from the places that the robot can reach but not by driving straight. By default the start is in the
     middle of four screens, and goals are behind them.

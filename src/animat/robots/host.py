@@ -1,4 +1,4 @@
-"""Robots that are stepped on the host, outside compiled code: external bodies, many side by side."""
+"""Robots that are stepped outside JAX: external bodies, many side by side."""
 
 from __future__ import annotations
 
@@ -78,9 +78,9 @@ class HostRobot(Robot[Any]):
         return jnp.zeros(len(self.observation_spec), jnp.float32)
 
     def advance(self, uniforms: Any, state: Any, u: Any) -> Any:
-        """Refused: it is stepped on the host."""
+        """Refused: it is stepped outside JAX."""
         raise InvalidArgument(
-            f"robot: expected one that is stepped in JAX, got {self.name}, which is stepped on the host: only train, "
+            f"robot: expected one that is stepped in JAX, got {self.name}, which is stepped outside JAX: only train, "
             "evaluate, run, live and studies take it"
         )
 

@@ -1,4 +1,4 @@
-"""Soft Actor-Critic for bodies that are stepped on the host: acting and learning are compiled, the bodies are not.
+"""Soft Actor-Critic for bodies that are stepped outside JAX: acting and learning are compiled, the bodies are not.
 
 A round is divided where the bodies move: one compiled program takes what they did, learns, and acts for the next one.
 """
@@ -105,7 +105,7 @@ def _compiled(environment: Environment[Any], algorithm: SAC) -> tuple[Callable[.
 
 
 class OnHost:
-    """`begin` and `train_chunk` of `animat.training.sac` for policies of a robot that is stepped on the host.
+    """`begin` and `train_chunk` of `animat.training.sac` for policies of a robot that is stepped outside JAX.
 
     Between chunks the learners hold the bodies as data (`Snapshot`), so checkpoints are like those of other robots.
     """

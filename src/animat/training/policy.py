@@ -300,7 +300,7 @@ class Policy:
             )
         except (KeyError, TypeError, ValueError, OverflowError, AnimatError) as error:
             reason = f"no entry {error}" if isinstance(error, KeyError) else error
-            raise InvalidFile(f"{path}: expected a complete, consistent policy, got a faulty one: {reason}") from error
+            raise InvalidFile(f"{path}: this policy cannot be loaded: {reason}") from error
 
 
 def whole_curve(curve: Float[np.ndarray, "*_ columns"]) -> Float[np.ndarray, "*_ columns"]:
@@ -332,8 +332,9 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray[Any, Any]], dict[str, Any]]:
                 )
             arrays = {name: file.get_tensor(name) for name in kinds}
     except (SafetensorError, OSError, ValueError) as error:
+        reason = str(error).removeprefix("Error while deserializing header: ")
         raise InvalidFile(
-            f"{path}: expected a policy, as animat train writes it, got a file that cannot be read as one: {error}"
+            f"{path}: expected a policy, as animat train writes it, got a file that cannot be read as one ({reason})"
         ) from error
     with in_file(path):
         description = json_data(metadata["animat"], "metadata")

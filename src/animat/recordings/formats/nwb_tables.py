@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import uuid
+from collections.abc import Mapping
 from datetime import UTC, datetime
 from typing import Any
 
@@ -18,13 +19,13 @@ from pynwb.misc import Units
 
 from animat.errors import InvalidArgument
 from animat.recordings.formats.nwb_layout import FORMAT_VERSION, SUBJECT
-from animat.recordings.metadata import to_metadata
+from animat.recordings.metadata import date_of, to_metadata
 from animat.recordings.recorded_culture import UNKNOWN_SUBJECT_ID
 from animat.recordings.recording import Channels, Recording
 from animat.stimulation.stimulus import NOTHING, Stimuli
 from animat.tables import UNKNOWN
 
-UNKNOWN_DATE = "1970-01-01T00:00:00+00:00"
+UNKNOWN_DATE = datetime(1970, 1, 1, tzinfo=UTC)
 """NWB requires a date; a recording without `recorded_at` gets this one, which readers recognise as unknown."""
 
 UNKNOWN_SUBJECT = {
@@ -45,7 +46,7 @@ def nwb_file(recording: Recording, spike_counts: Int64[np.ndarray, " channels"])
             "session_description", "Spikes of a neuronal culture on a multi-electrode array, under stimulation."
         ),
         identifier=str(uuid.uuid4()),
-        session_start_time=_date(texts.get("recorded_at", UNKNOWN_DATE)),
+        session_start_time=_date(texts),
         experimenter=_split(texts["experimenter"], ";") if "experimenter" in texts else None,
         keywords=_split(texts.get("keywords", "multi-electrode array, neuronal culture, electrical stimulation"), ","),
         source_script="animat.recordings.formats.nwb.write_nwb",
@@ -174,14 +175,15 @@ def _text(name: str, text: object) -> str:
     return text
 
 
-def _date(text: str) -> datetime:
-    try:
-        date = datetime.fromisoformat(text)
-    except ValueError as error:
+def _date(texts: Mapping[str, str]) -> datetime:
+    if "recorded_at" not in texts:
+        return UNKNOWN_DATE
+    if (date := date_of(texts)) is None:
         raise InvalidArgument(
-            f"provenance['recorded_at']: expected an ISO 8601 date such as 2024-05-31T14:00:00+09:00, got {text!r}"
-        ) from error
-    return date if date.tzinfo else date.replace(tzinfo=UTC)
+            "provenance['recorded_at']: expected an ISO 8601 date such as 2024-05-31T14:00:00+09:00, got "
+            f"{texts['recorded_at']!r}"
+        )
+    return date
 
 
 def _split(text: str, mark: str) -> list[str]:

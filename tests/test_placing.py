@@ -1,0 +1,41 @@
+"""Recordings without a culture's clock are placed by their dates."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from animat.cli import main
+from animat.errors import InvalidFile
+from animat.recordings.conversion import Origin, convert_recording
+from animat.recordings.formats.nwb import write_nwb
+from animat.recordings.reading import read_recordings
+from synthetic_recordings import synthetic_recording
+
+
+def test_recordings_of_rigs_are_placed_by_their_dates(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    first, second, undated = (tmp_path / f"{name}.nwb" for name in ("z", "a", "undated"))
+    recording = synthetic_recording(1, patterns=20, channels=32)
+    write_nwb(recording, undated)
+    convert_recording(undated, first, Origin(recorded_at="2024-05-31T14:00:00+09:00"))
+    convert_recording(undated, second, Origin(recorded_at="2024-05-31T06:12:30Z"))
+    read = read_recordings([second, first])
+    assert [each.start_min for each in read] == [0.0, 72.5]
+    note = "some recordings start at the same minute, so all are placed by their dates: at 0 min, 72.5 min"
+    assert all([(f.name, f.message) for f in each.findings[-1:]] == [("placed-by-date", note)] for each in read)
+    # One alone, and those whose starts differ, stay where they are.
+    assert read_recordings(second)[0].start_min == 0.0 and read_recordings(second)[0].findings == recording.findings
+    later = tmp_path / "later.nwb"
+    convert_recording(undated, later, Origin(recorded_at="2024-05-31T06:12:30Z"), start_min=10.0)
+    assert [each.start_min for each in read_recordings([first, later])] == [0.0, 10.0]
+    for others in ([first, undated], [first, first]):
+        with pytest.raises(InvalidFile, match=r"both start at 0 min; .* convert all with their dates"):
+            read_recordings(others)
+    assert main(["inspect", str(first), str(second), "--out", str(tmp_path / "figures"), "--json"]) == 0
+    *printed, last = capsys.readouterr().out.splitlines()
+    assert f"  note     placed-by-date: {note}" in printed
+    inspected = json.loads(last)
+    assert [finding["name"] for finding in inspected["together"]] == ["placed-by-date"]
+    assert [Path(figure).name for figure in inspected["figures"]][-1] == "series-drift.png"
