@@ -108,13 +108,9 @@ def over_rounds(
 
 @dataclass(frozen=True, eq=False)
 class Courses:
-    """The arms of one mapping over time, with their common return of random actions and optimal return.
+    """The mean returns of one mapping's policies at every recording, by arm, with random actions and the optimum.
 
-    Attributes:
-        title: the mapping.
-        returns: mean return of each policy at each recording, by the arm's name.
-        optimum: optimal return on a coarse grid at each recording; NaN if not known.
-        fine_optimum: optimal return on a fine grid at some of the minutes.
+    The optimum is on a coarse grid, NaN if it is not known; `fine_optimum` is on a fine grid at some of the minutes.
     """
 
     title: str

@@ -45,13 +45,7 @@ MANIFEST = "cultures.json"
 
 @dataclass(frozen=True)
 class CulturesRun:
-    """Results of a run over cultures.
-
-    Attributes:
-        finished, failed: the finished cultures, and the errors of the others, by the names of their folders.
-        comparisons, summary: of each finished culture, and over all of them.
-        parquet: the scores as a Parquet table; None if fastparquet is missing.
-    """
+    """Results of each finished culture, errors of the others, and a summary; `parquet`: None without fastparquet."""
 
     folder: Path
     finished: dict[str, StudyRun]
@@ -85,8 +79,8 @@ def run_over_cultures(
     Recording a culture uses one core only; meanwhile the others do jobs of other cultures. If the study of a culture
     fails, the others continue, and the failure is reported at the end. More cultures may be added later.
 
-    Arguments and errors are those of `run_study`, for a study with `seeds` or `folders` in its culture; AnimatError is
-    raised if the study of every culture failed, with the error of each.
+    Arguments and errors are those of `run_study`, for a study with `seeds` or `folders` in its culture; AnimatError
+    also if the study of every culture failed.
     """
     expect_workers(workers, executor)
     folder = Path(folder).absolute()

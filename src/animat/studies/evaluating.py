@@ -57,10 +57,9 @@ class Evaluate(StudyTask):
 
 @dataclass(frozen=True)
 class Control(StudyTask):
-    """Run the controls of a mapping on a robot: random, constant, heuristic; with policies also silent and shuffled.
+    """Run the controls of a mapping on a robot: that of the arm `plain`, whose policies are used if it `is_usual`.
 
     The best coupling is run at the last recording only, as its search takes as long as all other controls together.
-    The arm `plain` gives the mapping; its policies are used if it `is_usual`.
     """
 
     sizes = ("policies", "episodes", "episodes_over_time")

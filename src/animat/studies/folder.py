@@ -90,17 +90,11 @@ def claim_folder(
 ) -> Iterator[None]:
     """Claim a folder for some work: lock out other runs, and delete what a killed run left unfinished.
 
-    Nothing in the folder is touched before it is known to be free or to belong to this work.
+    Nothing in it is touched before it is known to be free or to belong to this work (`what`, in messages), which the
+    manifest describes with a fingerprint. It is written to `file`, and further texts to files `beside` it, by name.
 
-    Args:
-        what: kind of work for messages, such as `study`.
-        manifest: description of the work, with a fingerprint, and the name of the `file` for it.
-        beside: text of further files, by their names.
-        own_folders: every folder that the work makes in its folder.
-
-    Raises:
-        Mismatch: if the folder belongs to other work, holds other files, or is in use by another run.
-        InvalidFile: if it cannot be read or created.
+    Raises Mismatch if the folder belongs to other work, holds other files, or is in use by another run, and InvalidFile
+    if it cannot be read or created.
     """
     expect_no_file(folder, f"the {what}")
     files = {file: json.dumps(manifest, indent=1, sort_keys=True) + "\n", **beside}

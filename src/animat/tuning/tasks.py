@@ -85,13 +85,9 @@ def programs(environment: Environment[Any], algorithm: SAC) -> tuple[Callable[..
 
 
 class Trials(SideBySide):
-    """The policies of several trials during training, one group per trial.
+    """The policies of several trials during training, one group per trial; their settings differ only in `NUMBERS`.
 
-    Args:
-        training: the training of all trials, except for the settings in `NUMBERS`.
-        timeline: the simulators they are trained on; None without neurons.
-        algorithms: settings of each trial, which differ only in `NUMBERS`.
-        members: numbers of each trial's policies, which decide their random numbers: all trials use the same ones.
+    The numbers of each trial's policies, `members`, decide their random numbers: all trials use the same ones.
     """
 
     def __init__(
@@ -126,7 +122,6 @@ class TrainTrials(StudyTask):
     that is easiest to control would win. All trials use the same random numbers.
 
     Attributes:
-        members: numbers of the trials' policies.
         seeds: of training and, for the group of the first policies, of the episodes.
         chunks: the chunks of training, from the first up to but excluding the last.
         place: folder of the returns and, up to the end of training, of the learners, relative to the tuning's.
