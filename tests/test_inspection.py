@@ -14,10 +14,11 @@ from animat.neurons.simulator import fit_empirical
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
 from animat.report.array import draw_array
+from animat.report.colours import condition_colours
 from animat.report.inspection import draw_inspection, inspection_text
 from animat.report.response_histograms import draw_burst_separation, draw_response_histograms, rate_edges
 from animat.report.spikes import draw_psth, draw_raster
-from animat.report.style import condition_colours, save_figure
+from animat.report.style import save_figure
 from animat.responses.condition import Condition
 from animat.responses.conditions import All, Assignment, ByElectrode, ByFrequency, ByInterval, ByPattern, Conditions
 from animat.responses.extraction import extract_responses

@@ -58,6 +58,9 @@ ROW = ComparedReturns(
     effect_low_95=-1.0, effect_high_95=1.0, outcome=NONE, paper_u=0.0, paper_p=1.83e-4, as_in_paper="no",
 )  # fmt: skip
 
+NOT_KNOWN = np.array([np.nan]), np.array([np.nan])
+"""Returns of random actions and optimal returns of a learning curve."""
+
 
 # --- outcomes -------------------------------------------------------------------------------------------------------
 
@@ -500,14 +503,14 @@ def test_learning_curves_are_of_whole_rounds_of_episodes() -> None:
 def test_intervals_of_learning_curves_cover_what_they_say_and_one_policy_has_none() -> None:
     returns = np.random.default_rng(1).normal(size=(4, 4000))
     returns[:2, :1000] = np.nan
-    mean, low, high = LearningCurve("a", np.arange(1.0, 4001.0), returns).mean_with_interval()
+    mean, low, high = LearningCurve("a", np.arange(1.0, 4001.0), returns, *NOT_KNOWN).mean_with_interval()
     np.testing.assert_allclose(mean, np.nanmean(returns, axis=0))
     for some in (slice(1000), slice(1000, None)):
         assert np.mean((low[some] <= 0) & (high[some] >= 0)) == pytest.approx(0.95, abs=0.02)
-    alone = LearningCurve("a", np.array([1.0, 2.0]), np.array([[5.0, np.nan]]))
+    alone = LearningCurve("a", np.array([1.0, 2.0]), np.array([[5.0, np.nan]]), *NOT_KNOWN)
     np.testing.assert_equal(alone.mean_with_interval(), [[5.0, np.nan], [np.nan] * 2, [np.nan] * 2])
     assert legend(draw_learning_curves([alone], "cartpole")) == {"mean of the policies"}
-    ends = LearningCurve("a", np.array([1.0]), np.array([[120.0], [-91.0]]), within=(-219.0, 120.0))
+    ends = LearningCurve("a", np.array([1.0]), np.array([[120.0], [-91.0]]), *NOT_KNOWN, within=(-219.0, 120.0))
     assert ends.mean_with_interval()[:, 0].tolist() == [14.5, -219.0, 120.0]
 
 
@@ -646,7 +649,7 @@ def test_optima_over_time_are_labelled_coarse_and_missing_arms_are_counted() -> 
     returns = {f"c{i}": np.zeros((2, 2)) for i in range(8)}
     panels = [
         Courses("1-threshold", minutes, returns, np.zeros(2), np.ones(2), {0.0: 1.1}),
-        Courses("linear", minutes, {"linear": np.zeros((2, 2))}, np.zeros(2)),
+        Courses("linear", minutes, {"linear": np.zeros((2, 2))}, np.zeros(2), np.full(2, np.nan)),
     ]
     figure = draw_over_time(panels, "cartpole", trained_until_min=5.0)
     said = legend(figure)

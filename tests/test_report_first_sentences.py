@@ -73,11 +73,12 @@ def long_named(kind: str) -> Figure:
         pair = Pair(replace(ROW, first=LONG[0], second=LONG[1], robot=ON[0]), means, means + 1, 0.0)
         return draw_comparisons([pair, pair], f"{ON[0]}: comparisons")
     if kind == "learning":
-        curves = [LearningCurve(name, minutes, np.ones((3, 2))) for name in (*LONG, "a")]
+        curves = [LearningCurve(name, minutes, np.ones((3, 2)), minutes, minutes) for name in (*LONG, "a")]
         return draw_learning_curves(curves, f"{ON[0]}: learning")
     if kind == "over time":
         name = "my_laboratory.another_package.mappings:Steep, percentiles fixed"
-        courses = [Courses(f"{name} {i}", minutes, {each: np.ones((3, 2)) for each in LONG}, minutes) for i in (1, 2)]
+        returns = {each: np.ones((3, 2)) for each in LONG}
+        courses = [Courses(f"{name} {i}", minutes, returns, minutes, np.full(2, np.nan)) for i in (1, 2)]
         return draw_over_time(courses, f"{ON[0]}: at every recording", trained_until_min=5.0)
     if kind == "over cultures":
         row = OverCultures(LONG[0], ON[0], 2, 1.0, 1.2, 0.2, 0.1, 0.3, 2, 2, 2)

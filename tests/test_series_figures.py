@@ -14,10 +14,10 @@ from matplotlib.colors import to_hex
 from animat.errors import InvalidArgument, Mismatch
 from animat.recordings.recording import Recording
 from animat.report.array import draw_array, draw_selection
+from animat.report.colours import MEDIAN, condition_colours
 from animat.report.drift import draw_drift
 from animat.report.inspection import draw_series
 from animat.report.response_histograms import draw_response_histograms, draw_responses_over_time
-from animat.report.style import MEDIAN, condition_colours
 from animat.responses.conditions import conditions_named
 from animat.responses.extraction import extract_responses
 from animat.responses.responses import Responses

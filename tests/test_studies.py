@@ -59,6 +59,7 @@ from animat.studies.toml import read_study, study_to_toml
 from animat.studies.training import training_of
 from animat.training.lessons import read_lessons
 from animat.training.policy import Policy
+from animat.tuning.tasks import Fit as FitOfTuning
 from animat.writing import LOCK, exclusive_lock
 from cultures import small_culture
 from synthetic_recordings import synthetic_recording, write_synthetic_series
@@ -1006,6 +1007,10 @@ def test_recordings_that_leave_nothing_to_choose_are_refused(tmp_path: Path) -> 
         Fit(one).run(tmp_path / "study", Silent())
     knowing = replace(one, simulators=Simulators(conditions="all", allow=("one-condition",)))
     kept, _ = Fit(knowing).run(tmp_path / "study", Silent())
+    assert len(load_timeline(kept).conditions) == 1
+    with pytest.raises(UnusableData, match=r"simulators\.conditions: expected two or more"):
+        FitOfTuning(one).run(tmp_path / "study", Silent())
+    (kept,) = FitOfTuning(knowing).run(tmp_path / "study", Silent())
     assert len(load_timeline(kept).conditions) == 1
 
 

@@ -31,10 +31,10 @@ from animat.studies.episodes import COLUMNS, RANDOM, Paths, episode_rows, mean_r
 from animat.studies.evaluating import Evaluate
 from animat.studies.folder import RESULTS, controls_file, episodes_file, optima_file, table_file
 from animat.studies.optima import FindOptima, read_optima
-from animat.studies.pictures import _courses, _minutes_in_training, write_paths
+from animat.studies.pictures import _courses, _minutes_in_training, paths_rows
 from animat.studies.recording import Fit, Record
 from animat.studies.report_tables import optima_table
-from animat.studies.results import read_typed, write_typed
+from animat.studies.results import read_typed, write_table, write_typed
 from animat.studies.source import Source
 from animat.studies.specification import Arm, Compared, RobotSpec, Study, mapping_label
 from animat.studies.tabulating import References, Tabulate, _controls, _finite, _optimum_error, _scores
@@ -202,7 +202,7 @@ def test_paths_have_a_column_for_each_command(
     # The second episode has ended after one iteration; what follows is meaningless.
     commands = np.resize([0.5, -1.0, 0.25, 0.0], (2, 2, *shape))
     recorded = Paths(np.zeros((2, 3, 1)), commands, np.array([2, 1]))
-    lines = write_paths(tmp_path, "rover", ["x"], {"a": recorded}).read_text().splitlines()
+    lines = write_table(tmp_path / "paths.csv", *paths_rows(["x"], {"a": recorded})).read_text().splitlines()
     assert lines[0] == ",".join(["arm,policy,iteration,x", *heads])
     assert lines[1:4] == [f"a,p0,{i},0.0,{cell}" for i, cell in enumerate(cells)] and len(lines) == 6
 

@@ -51,7 +51,7 @@ class _Core:
         if client != self._client:
             self._renew()
             self._client = client
-        began_s, starved = time.monotonic(), _times_starved()
+        began_s = time.monotonic()
         future = self._processes.submit(_answer, call)
         while not wait([future], _LOOK_EVERY_S).done:
             if not _is_wanted(worker, key):
@@ -61,8 +61,7 @@ class _Core:
         try:
             return Answer(future.result(), took_s=took_s)
         except BrokenExecutor as error:
-            memory = ", as the machine ran out of memory" if _times_starved() > starved else ""
-            return Answer(ended=f"{error}{memory}, on {platform.node()}", took_s=took_s)
+            return Answer(ended=f"{error}, on {platform.node()}", took_s=took_s)
         except Exception as error:
             return Answer(error=error, took_s=took_s)
 
@@ -133,15 +132,6 @@ def _answer(call: bytes) -> Any:
 def _is_wanted(worker: Any, key: object) -> bool:
     task = worker.state.tasks.get(key)
     return task is not None and task.state == "executing" and worker.status.name in ("running", "paused")
-
-
-def _times_starved() -> int:
-    """How often the kernel of this machine has killed a process as memory ran out."""
-    try:
-        counts = dict(line.split() for line in Path("/proc/vmstat").read_text().splitlines())
-        return int(counts["oom_kill"])
-    except (OSError, ValueError, KeyError):
-        return 0
 
 
 def _own_cores(threads: int) -> list[int]:

@@ -34,14 +34,12 @@ _SILENT_S = 60.0
 
 @dataclass(eq=False)
 class Call:
-    """A call that waits or runs.
+    """A call that waits or runs; it has failed, and its process or worker ended (`deaths`), so many times.
 
     Attributes:
         pickled: returns the pickled function, arguments and keyword arguments for a worker with this folder.
-        cost_s: approximate duration; None if unknown.
         reads: files that are sent along, by the digests under which they are stored.
         finish: function applied here to the returned value.
-        failures, deaths: how often it failed, and how often its process or its worker ended.
     """
 
     name: str

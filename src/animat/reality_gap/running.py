@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, wait
 from dataclasses import replace
 from typing import Any
 
@@ -21,7 +19,6 @@ from animat.coding.encoder import electrode_pulses
 from animat.cultures.base import Culture
 from animat.cultures.budget import Account
 from animat.cultures.failures import describe_error
-from animat.cultures.virtual import VirtualCulture
 from animat.environment import Animat, Environment
 from animat.errors import InvalidArgument, UnusableData
 from animat.evaluation import transfer
@@ -31,7 +28,6 @@ from animat.evaluation.optimum import optimal_values
 from animat.evaluation.rollouts import networks_of
 from animat.evaluation.statistics import compare_episodes
 from animat.goals.tally import Outcome
-from animat.neurons.simulator import NeuronSimulator
 from animat.progress import Progress, in_phase
 from animat.reality_gap.calibration import Calibration
 from animat.reality_gap.outlook import outlook
@@ -151,9 +147,6 @@ def run_policies(
     of_each = planned_episodes(len(policies), len(controls), episodes)
     check_session(culture, loop, agents, of_each, seed)
 
-    why_no_optimum = _why_no_optimum(loop, calibration)
-    if why_no_optimum is not None:
-        findings += (Finding("no-optimum", "note", why_no_optimum),)
     predicted = predict(
         trained,
         tuple(policies),
@@ -164,47 +157,31 @@ def run_policies(
         seed=seed,
         progress=in_phase(progress, "predicting"),
     )
-    optimum = _begin_optimum(animat, simulator) if why_no_optimum is None else None
-    if optimum is not None and (loop.real_time or not isinstance(culture, VirtualCulture)):
-        # Such a loop must not wait for a core.
-        _wait_for_optimum(optimum, progress)
+    # Before the session, as a loop must not wait for a core.
+    optimum, why_none = _optimal_return(animat, calibration, progress)
     plan = [
         (n, predicted[each.name].presented, each.delivery != "silent") for n, each in zip(of_each, agents, strict=True)
     ]
     expected = outlook(loop, calibration, plan, account, age_min)
-    findings = (*noticed, *findings, *calibration.findings)
+    findings = (*noticed, *findings, *why_none, *calibration.findings)
     if report is not None:
         # Before the first pulse, so that the operator can still stop.
         for message in warnings_once(findings):
             report(f"warning: {message}")
         report(f"each pulse: {loop.pulse}")
         report(str(expected))
-    try:
-        expect_writable(folder, room_bytes=expected.room_bytes)
-        session = run_session(
-            culture,
-            loop,
-            agents,
-            folder,
-            episodes=of_each,
-            seed=seed,
-            account=account,
-            progress=in_phase(progress, "closed loop", sum(of_each), "episodes"),
-            predicted={
-                name: bootstrap_interval(of.returns.mean(), of.bootstrap_means) for name, of in predicted.items()
-            },
-        )
-    except Exception:
-        # A program that exits while JAX computes is killed by a signal.
-        wait([] if optimum is None else [optimum])
-        raise
-    best = None
-    # A user who stopped the session does not wait for it; after any other ending the program would exit meanwhile.
-    if optimum is not None and (optimum.done() or session.ending.by != "person"):
-        try:
-            best = _wait_for_optimum(optimum, progress)
-        except Exception as error:
-            findings += (Finding("no-optimum", "note", f"no optimal return: {describe_error(error)}"),)
+    expect_writable(folder, room_bytes=expected.room_bytes)
+    session = run_session(
+        culture,
+        loop,
+        agents,
+        folder,
+        episodes=of_each,
+        seed=seed,
+        account=account,
+        progress=in_phase(progress, "closed loop", sum(of_each), "episodes"),
+        predicted={name: bootstrap_interval(of.returns.mean(), of.bootstrap_means) for name, of in predicted.items()},
+    )
     rows = _rows(agents, tuple(policies), predicted, session, loop, first.pulse_cost)
     gap_reasons: tuple[Finding, ...] = ()
     if sign := rows[0].gap_sign:
@@ -213,7 +190,7 @@ def run_policies(
     return RealityGap(
         loop=loop,
         calibrated_at_min=calibration.start_min,
-        optimum=best,
+        optimum=optimum,
         rows=rows,
         session=session,
         account=account,
@@ -266,37 +243,24 @@ def planned_episodes(policies: int, controls: int, episodes: int) -> list[int]:
     return [episodes] * policies + [min(episodes, of_a_control)] * controls
 
 
-def _why_no_optimum(loop: Loop, calibration: Calibration) -> str | None:
-    """Why the optimal return cannot be computed; None if it can."""
-    reason = why_no_grid(loop.robot)
-    if few := too_few(loop.conditions, [len(responses) for responses in calibration.responses_hz]):
+def _optimal_return(
+    environment: Animat[Any], calibration: Calibration, progress: Progress | None
+) -> tuple[float | None, tuple[Finding, ...]]:
+    """The optimal return on the recording's simulator, or a finding that says why there is none."""
+    robot, reason = environment.robot, why_no_grid(environment.robot)
+    if few := too_few(calibration.conditions, [len(responses) for responses in calibration.responses_hz]):
         reason = f"these conditions have too few responses: {', '.join(few)}"
-    return None if reason is None else lacking(loop.robot).get("value_grid", f"no optimal return: {reason}")
-
-
-def _begin_optimum(environment: Animat[Any], simulator: NeuronSimulator) -> Future[float]:
-    """The optimal return, computed in a background thread, on another core than a loop without deadlines."""
-    optimum: Future[float] = Future()
-
-    def work() -> None:
+    if reason is None:
+        in_phase(progress, "optimal return").update(0, 1, "computing it on the simulator")
         try:
             # Only the value, which is reported as "about": its uncertainty would take a third longer.
-            grid = grid_for(environment.robot).scaled(_RESOLUTION)
-            (value,), _ = optimal_values([(environment, simulator)], grid, seed=1)
-            optimum.set_result(float(value))
-        except BaseException as error:
-            optimum.set_exception(error)
-
-    # A daemon, so that a user who stops the program need not wait for it.
-    threading.Thread(target=work, name="optimal return", daemon=True).start()
-    return optimum
-
-
-def _wait_for_optimum(optimum: Future[float], progress: Progress | None) -> float:
-    """Wait for the value, or raise the error because of which it could not be computed."""
-    if not optimum.done():
-        in_phase(progress, "optimal return").update(0, 1, "computing it on the simulator")
-    return optimum.result()
+            case = environment, calibration.simulator
+            (value,), _ = optimal_values([case], grid_for(robot).scaled(_RESOLUTION), seed=1)
+            return float(value), ()
+        except Exception as error:
+            reason = describe_error(error)
+    message = lacking(robot).get("value_grid", f"no optimal return: {reason}")
+    return None, (Finding("no-optimum", "note", message),)
 
 
 def check_policies(policies: Mapping[str, Policy]) -> Policy:

@@ -45,9 +45,7 @@ class SessionResponses:
     Attributes:
         responses: in order of time, on the session's clock, with everything that was presented between them.
         episode: index in `returns` of each response's episode.
-        moved: whether it moved the robot, and was not repeated or skipped as a burst.
-        command: with which it moved the robot; NaN if it did not.
-        returns: of the episodes, in order of time.
+        moved: whether it moved the robot, and was not repeated or skipped as a burst; `command`: NaN if it did not.
     """
 
     responses: Responses

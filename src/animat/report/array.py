@@ -10,7 +10,8 @@ from jaxtyping import Float64
 from animat.errors import counted
 from animat.lazy import Axes, Figure
 from animat.recordings.recording import Recording
-from animat.report.style import GREY, RED, add_legend, new_figure, style_axes
+from animat.report.colours import GREY, RED
+from animat.report.style import add_legend, new_figure, style_axes
 from animat.stimulation.selection import Selection
 from animat.tables import UNKNOWN
 

@@ -8,7 +8,8 @@ import numpy as np
 from jaxtyping import Float64
 
 from animat.lazy import Figure
-from animat.report.style import BLACK, GREY, RED, add_legend, condition_colours, new_figure, style_axes
+from animat.report.colours import BLACK, GREY, RED, condition_colours
+from animat.report.style import add_legend, new_figure, style_axes
 from animat.responses.responses import Responses
 
 PERCENTILES = (10, 25, 50, 75, 90)

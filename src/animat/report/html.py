@@ -45,11 +45,9 @@ def with_links(text: str, files: Sequence[str] = ()) -> str:
 
 @dataclass(frozen=True)
 class Picture:
-    """A figure of the page.
+    """A figure of the page as PNG, whose title is also its alternative text.
 
     Attributes:
-        file: the PNG.
-        title: also the alternative text.
         beside: files with the same figure in other formats and with its numbers, relative to the page.
         narrow: the PNG for phones, as wide as their screen; None: the same PNG, which scrolls there.
     """

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from animat.columns import align_columns
 from animat.errors import InvalidArgument, Mismatch, counted
 from animat.lazy import Figure
 from animat.recordings.findings import Finding
@@ -158,16 +159,13 @@ def _histogram(recording: Recording, inspection: Inspection) -> PostStimulusHist
     return post_stimulus_histogram(recording, -0.4 * to_ms, to_ms, 1.0 if to_ms <= 100 else 5.0)
 
 
-def _table(inspection: Inspection) -> Iterator[str]:
-    conditions = inspection.conditions
-    chosen = " (chosen by default)" if inspection.by_default else ""
-    shown = conditions[:_MOST_CONDITIONS]
-    width = max([len("condition"), *(len(c.label) for c in shown)])
-    yield f"  conditions: {inspection.responses.by}{chosen}"
-    yield f"  {'condition':<{width}}  responses  non-burst  median x (Hz)  P(x >= P50)"
-    for c in shown:
+def _table(inspection: Inspection) -> list[str]:
+    cells = []
+    for c in inspection.conditions[:_MOST_CONDITIONS]:
         median, share = (f"{c.median_rate_hz:.2f}", f"{c.share_above_median:.2f}") if c.n_non_burst else ("-", "-")
-        counts = f"{c.n_responses:>9,}  {c.n_non_burst:>9,}"
-        yield f"  {c.label:<{width}}  {counts}  {median:>13}  {share:>11}"
-    if len(conditions) > len(shown):
-        yield f"  ... and {len(conditions) - len(shown)} more"
+        cells.append([c.label, f"{c.n_responses:,}", f"{c.n_non_burst:,}", median, share])
+    chosen = " (chosen by default)" if inspection.by_default else ""
+    head = ["condition", "responses", "non-burst", "median x (Hz)", "P(x >= P50)"]
+    lines = [f"  conditions: {inspection.responses.by}{chosen}", *align_columns(head, cells)]
+    more = len(inspection.conditions) - len(cells)
+    return [*lines, f"  ... and {more} more"] if more else lines

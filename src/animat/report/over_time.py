@@ -10,7 +10,8 @@ from jaxtyping import Float64
 
 from animat.evaluation.statistics import CONFIDENCE
 from animat.lazy import Figure
-from animat.report.style import BLUE, GREY, OPTIMUM, PALETTE, add_common_legend, grid_of_panels, style_axes, wrapped
+from animat.report.colours import BLUE, GREY, OPTIMUM, PALETTE
+from animat.report.style import add_common_legend, grid_of_panels, style_axes, wrapped
 
 _NARROW_IN, _WIDE_IN = 3.1, 4.6
 """Widths of a panel with a learning curve, and of one with returns at every recording."""
@@ -25,15 +26,15 @@ class LearningCurve:
     Attributes:
         iterations: done at the end of each chunk of training.
         returns: mean return of the episodes that ended by then (`over_rounds`), NaN if not known.
-        random, optimum: random and optimal return with the simulator in use in each chunk, NaN or None if not known.
+        random, optimum: random and optimal return with the simulator in use in each chunk, NaN if not known.
         within: the lowest and the highest possible return, which limit intervals.
     """
 
     name: str
     iterations: Float64[np.ndarray, " chunks"]
     returns: Float64[np.ndarray, "policies chunks"]
-    random: Float64[np.ndarray, " chunks"] | None = None
-    optimum: Float64[np.ndarray, " chunks"] | None = None
+    random: Float64[np.ndarray, " chunks"]
+    optimum: Float64[np.ndarray, " chunks"]
     within: tuple[float, float] = (-np.inf, np.inf)
 
     def mean_with_interval(self) -> Float64[np.ndarray, "3 chunks"]:
@@ -70,7 +71,7 @@ def draw_learning_curves(curves: Sequence[LearningCurve], title: str) -> Figure:
             ("optimal return", curve.optimum, OPTIMUM, "--"),
             ("random actions", curve.random, GREY, ":"),
         ):
-            if levels is not None and np.isfinite(levels).any():
+            if np.isfinite(levels).any():
                 # A level holds up to the end of its chunk; the first chunk begins at 0.
                 steps = np.append(0.0, x), np.append(levels[:1], levels)
                 axes.step(*steps, where="pre", color=colour, linestyle=line, linewidth=1.2, label=name)
@@ -107,20 +108,16 @@ def over_rounds(
 
 @dataclass(frozen=True, eq=False)
 class Courses:
-    """The arms of one mapping over time, with their common return of random actions and optimal return.
+    """The mean returns of one mapping's policies at every recording, by arm, with random actions and the optimum.
 
-    Attributes:
-        title: the mapping.
-        returns: mean return of each policy at each recording, by the arm's name.
-        optimum: optimal return on a coarse grid at each recording; None if not known.
-        fine_optimum: optimal return on a fine grid at some of the minutes.
+    The optimum is on a coarse grid, NaN if it is not known; `fine_optimum` is on a fine grid at some of the minutes.
     """
 
     title: str
     minutes: Float64[np.ndarray, " recordings"]
     returns: Mapping[str, Float64[np.ndarray, "policies recordings"]]
     random: Float64[np.ndarray, " recordings"]
-    optimum: Float64[np.ndarray, " recordings"] | None = None
+    optimum: Float64[np.ndarray, " recordings"]
     fine_optimum: Mapping[float, float] = field(default_factory=dict)
 
     def quartiles(self, arm: str) -> Float64[np.ndarray, "3 recordings"]:
@@ -141,7 +138,7 @@ def draw_over_time(panels_of: Sequence[Courses], title: str, *, trained_until_mi
             low, middle, high = of.quartiles(name)
             axes.fill_between(minutes, low, high, color=colour, alpha=0.2, linewidth=0)
             axes.plot(minutes, middle, color=colour, marker=marker, markersize=3, label=name)
-        if of.optimum is not None:
+        if np.isfinite(of.optimum).any():
             label = "optimal return, coarse grid"
             axes.plot(minutes, of.optimum, color=OPTIMUM, linestyle="--", linewidth=1.3, label=label)
         if of.fine_optimum:

@@ -10,7 +10,8 @@ from jaxtyping import Float64
 
 from animat.errors import counted
 from animat.lazy import Axes, Figure
-from animat.report.style import BLACK, BLUE, MEDIAN, RED, add_legend, condition_colours, new_figure, style_axes, wrapped
+from animat.report.colours import BLACK, BLUE, MEDIAN, RED, condition_colours
+from animat.report.style import add_legend, new_figure, style_axes, wrapped
 from animat.responses.responses import Responses
 from animat.tables import evenly
 

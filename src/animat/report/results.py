@@ -184,7 +184,7 @@ class OverCultures:
     Attributes:
         mean_first, mean_second: mean returns of the arms, each culture counting the same.
         difference: mean of the cultures' differences, second minus first.
-        low_95, high_95: its percentile bootstrap interval over cultures, too narrow with few; None with fewer than two.
+        low_95, high_95: its interval over cultures, by Student's t; None with fewer than two.
         larger_in, holds_in: numbers of cultures in which the second arm's mean return is larger, and significantly so.
         tested: number of cultures with enough policies to find a difference.
     """

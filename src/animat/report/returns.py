@@ -3,27 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
 
 from animat.lazy import Axes, Figure
+from animat.report.colours import BLACK, BLUE, GREY, OPTIMUM, ORANGE, SKY
 from animat.report.html import cell, with_minus
 from animat.report.results import TRAINED, ComparedReturns, ControlReturns, OverCultures, Score
-from animat.report.style import (
-    BLACK,
-    BLUE,
-    GREY,
-    OPTIMUM,
-    ORANGE,
-    SKY,
-    add_common_legend,
-    grid_of_panels,
-    new_figure,
-    style_axes,
-    wrapped,
-)
+from animat.report.style import add_common_legend, grid_of_panels, new_figure, style_axes, wrapped
 
 _WIDE_IN, _NARROW_IN = 2.3, 1.2
 """Widths of a name beside a panel, of which there are two in a row, and of an arm's, as two stand under a panel."""
@@ -120,8 +109,12 @@ def draw_comparisons(pairs: Sequence[Pair], title: str) -> Figure:
         )
         for place, (returns, random, optimum, colour) in enumerate(sides):
             _draw_boxes(whole, returns, place, colour)
-            _draw_references(whole, random, optimum, place)
             _draw_boxes(close, returns, place, colour)
+            ends = [place - 0.42, place + 0.42]
+            if random is not None:
+                whole.plot(ends, [random] * 2, color=GREY, linewidth=1.3, linestyle=":", label="random actions")
+            if optimum is not None:
+                whole.plot(ends, [optimum] * 2, color=OPTIMUM, linewidth=1.3, linestyle="--", label="optimal return")
         low, high = whole.get_ylim()
         room = high - low
         whole.plot([0, 0, 1, 1], high + room * np.array([0.03, 0.06, 0.06, 0.03]), color=BLACK, linewidth=0.9)
@@ -147,27 +140,13 @@ def _name(arm: str, score: float | None) -> str:
 
 
 def _draw_boxes(axes: Axes, returns: Float64[np.ndarray, " policies"], place: int, colour: str) -> None:
-    axes.boxplot(
-        [returns],
-        positions=[place],
-        widths=0.5,
-        showfliers=False,
-        patch_artist=True,
-        boxprops={"facecolor": colour, "alpha": 0.35, "linewidth": 0.8},
-        medianprops={"color": BLACK, "linewidth": 1.2},
-    )
+    box, median = {"facecolor": colour, "alpha": 0.35, "linewidth": 0.8}, {"color": BLACK, "linewidth": 1.2}
+    looks: dict[str, Any] = {"patch_artist": True, "boxprops": box, "medianprops": median}
+    axes.boxplot([returns], positions=[place], widths=0.5, showfliers=False, **looks)
     # Spread by rank, not at random, so that the figure is the same each time.
     sideways = np.zeros(len(returns))
     sideways[np.argsort(returns)] = 0.12 * np.resize([-1.0, 1.0, 0.0], len(returns))
     axes.scatter(place + sideways, returns, s=12, color=colour, edgecolors=BLACK, linewidths=0.4, zorder=3)
-
-
-def _draw_references(axes: Axes, random: float | None, optimum: float | None, place: int) -> None:
-    ends = [place - 0.42, place + 0.42]
-    if random is not None:
-        axes.plot(ends, [random] * 2, color=GREY, linewidth=1.3, linestyle=":", label="random actions")
-    if optimum is not None:
-        axes.plot(ends, [optimum] * 2, color=OPTIMUM, linewidth=1.3, linestyle="--", label="optimal return")
 
 
 def draw_controls(panels_of: Sequence[tuple[str, Sequence[ControlReturns]]], title: str) -> Figure:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -10,18 +11,8 @@ from jaxtyping import Float64, Int64
 from animat.errors import counted
 from animat.lazy import Axes, Figure
 from animat.recordings.recording import Recording
-from animat.report.style import (
-    BLACK,
-    BLUE,
-    GREY,
-    RED,
-    WINDOW,
-    add_common_legend,
-    add_legend,
-    condition_colours,
-    new_figure,
-    style_axes,
-)
+from animat.report.colours import BLACK, BLUE, GREY, RED, WINDOW, condition_colours
+from animat.report.style import add_common_legend, add_legend, new_figure, style_axes
 from animat.responses.bursts import NetworkBursts
 from animat.responses.psth import PostStimulusHistogram
 from animat.responses.responses import Responses
@@ -179,17 +170,11 @@ def _draw_stimuli(axes: Axes, recording: Recording, responses: Responses, from_m
 
 def _draw_rates(axes: Axes, rate_hz: Float64[np.ndarray, "rows bins"], from_ms: float, to_ms: float) -> None:
     """The rate in each row and bin as a shade, as so many dots would merge."""
+    looks: dict[str, Any] = {"cmap": "Greys", "aspect": "auto", "origin": "lower", "interpolation": "nearest"}
     # A burst in a row or two must not leave all others pale.
-    drawn = axes.imshow(
-        rate_hz,
-        cmap="Greys",
-        vmin=0,
-        vmax=max(float(np.quantile(rate_hz, 0.95)), 1e-9),
-        extent=(from_ms, to_ms, -0.5, len(rate_hz) - 0.5),
-        aspect="auto",
-        origin="lower",
-        interpolation="nearest",
-    )
+    highest_hz = max(float(np.quantile(rate_hz, 0.95)), 1e-9)
+    extent = (from_ms, to_ms, -0.5, len(rate_hz) - 0.5)
+    drawn = axes.imshow(rate_hz, vmin=0, vmax=highest_hz, extent=extent, **looks)
     bar = axes.figure.colorbar(drawn, ax=axes, extend="max", pad=0.02, shrink=0.6, anchor=(0.0, 0.0))
     bar.set_label("firing rate (Hz per channel)", fontsize=8)
     bar.ax.tick_params(labelsize=8)

@@ -17,13 +17,6 @@ from animat.writing import atomic_write
 
 FORMATS = ("png", "svg", "pdf")
 PNG_DPI = 160
-# Okabe and Ito's palette, which people with any common colour blindness can tell apart.
-BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
-BLUE, RED, PURPLE, GREY = "#0072B2", "#D55E00", "#CC79A7", "#8C8C8C"
-PALETTE = (BLUE, ORANGE, GREEN, PURPLE, SKY, RED)
-"""In the order of use."""
-WINDOW, OPTIMUM = ORANGE, BLACK
-MEDIAN = RED
 
 # Text stays text in an SVG. Without the salt, element names are random, and the same figure gives different files.
 _SAVING: dict[Any, Any] = {"svg.fonttype": "none", "svg.hashsalt": "animat"}
@@ -79,18 +72,6 @@ def _legend_width_in(labels: Sequence[str], columns: int) -> float:
     """The approximate width of a legend in 8-point type, in inches: each column has a sample and its longest label."""
     parts = np.array_split(np.array([len(label) for label in labels]), columns)
     return sum(0.53 + 0.062 * float(part.max()) for part in parts if len(part))
-
-
-def condition_colours(units: Sequence[str]) -> list[str]:
-    """A colour for each condition: along cividis for frequencies, which are ordered; Okabe-Ito for others."""
-    from matplotlib import colormaps
-    from matplotlib.colors import to_hex
-
-    n = len(units)
-    if n > 1 and (n > 6 or all(unit == "Hz" for unit in units)):
-        # The last tenth of cividis is too pale on white.
-        return [to_hex(colormaps["cividis"](0.88 * i / (n - 1))) for i in range(n)]
-    return list(PALETTE[:n])
 
 
 def save_figure(figure: Figure, path: str | os.PathLike[str]) -> Path:

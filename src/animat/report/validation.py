@@ -8,13 +8,14 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float64
 
+from animat.columns import align_columns
 from animat.lazy import Figure
 from animat.neurons.prediction import LAGS
 from animat.neurons.validation import FREE_RUNS, MARGINAL, PIT_BINS, Band, Validation, pit_shares
-from animat.report.style import BLACK, BLUE, GREEN, GREY, ORANGE, add_common_legend, new_figure, style_axes
+from animat.report.colours import BLACK, BLUE, GREEN, GREY, ORANGE
+from animat.report.style import add_common_legend, new_figure, style_axes
 
 _COLOURS = {MARGINAL: GREY, "histogram": ORANGE, "empirical": GREEN, "memory": BLUE}
-_HEADER = f"  {'simulator':<11}{'bits/trial':>11}{'CRPS (Hz)':>11}{'off by (p)':>14}{'lag 1':>8}{'run length':>25}"
 
 
 def validation_text(name: str, validation: Validation) -> str:
@@ -25,25 +26,23 @@ def validation_text(name: str, validation: Validation) -> str:
         f"  fitted to {sum(v.n_fitted):,} responses of the first half, scored on {sum(v.n_held):,} of the second"
         + ("" if np.isnan(v.drift) else f"; medians moved by {100 * v.drift:+.0f} %"),
         "",
-        _HEADER,
     ]
+    cells = []
     for s in v.scores:
-        runs = s.run_length
-        off = f"{s.distance:.3f} " + ("       " if s.p_value is None else f"({s.p_value:.3f})")
-        lines.append(
-            f"  {s.kind:<11}{s.bits.mean():>11.3f}{s.crps_hz.mean():>11.3f}{off:>14}{s.autocorrelation.mean[0]:>8.2f}"
-            f"{f'{runs.mean:.2f} ({runs.low:.2f} to {runs.high:.2f})':>25}"
-        )
-    lines.append(f"  {'recorded':<47}{v.autocorrelation[0]:>8.2f}{f'{v.run_length:.2f}':>25}")
+        off, runs = f"{s.distance:.3f}" + ("" if s.p_value is None else f" ({s.p_value:.3f})"), s.run_length
+        length = f"{runs.mean:.2f} ({runs.low:.2f} to {runs.high:.2f})"
+        means = f"{s.bits.mean():.3f}", f"{s.crps_hz.mean():.3f}"
+        cells.append([s.kind, *means, off, f"{s.autocorrelation.mean[0]:.2f}", length])
+    cells.append(["recorded", "", "", "", f"{v.autocorrelation[0]:.2f}", f"{v.run_length:.2f}"])
+    lines += align_columns(["simulator", "bits/trial", "CRPS (Hz)", "off by (p)", "lag 1", "run length"], cells)
     gains = [("conditions bring", v.gain("empirical", MARGINAL)), ("memory brings", v.gain("memory", "empirical"))]
     lines.append("  " + "; ".join(f"{of} {gain.value:.3f} +- {gain.error:.3f} bits per trial" for of, gain in gains))
-    width = max(len("condition"), *map(len, v.labels))
-    lines += ["", f"  {'condition':<{width}}  {'responses':>13}  {'median x (Hz)':>16}  P(x >= P50) {v.kind}, recorded"]
+    cells = []
     for c, label in enumerate(v.labels):
-        n = f"{v.n_fitted[c]:,}, {v.n_held[c]:,}"
-        medians = f"{v.medians_hz[0, c]:.2f}, {v.medians_hz[1, c]:.2f}"
-        lines.append(f"  {label:<{width}}  {n:>13}  {medians:>16}  {v.of(v.kind).above[c]:.2f}, {v.above[c]:.2f}")
-    return "\n".join(lines)
+        n, medians = f"{v.n_fitted[c]:,}, {v.n_held[c]:,}", f"{v.medians_hz[0, c]:.2f}, {v.medians_hz[1, c]:.2f}"
+        cells.append([label, n, medians, f"{v.of(v.kind).above[c]:.2f}, {v.above[c]:.2f}"])
+    head = ["condition", "responses", "median x (Hz)", f"P(x >= P50) {v.kind}, recorded"]
+    return "\n".join([*lines, "", *align_columns(head, cells)])
 
 
 def correlations_text(names: Sequence[str], correlations: Float64[np.ndarray, "2 pairs"]) -> str:

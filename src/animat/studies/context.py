@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import Any, final
+from typing import Any
 
 from animat.coding.mapping import mapping_named
 from animat.cultures.series import SELECTION_FILE, STATE_FILE, record_series
@@ -111,7 +111,6 @@ class ContextTask(Task):
         return folder / f"culture-{self.culture}" / name
 
 
-@final
 @dataclass(frozen=True)
 class RecordCulture(ContextTask):
     """Record the culture twice, ten minutes apart, for robots with this number of commands."""
@@ -148,8 +147,6 @@ class RobotTask(ContextTask):
         return folder / f"culture-{self.culture}" / self.robot / name
 
 
-@final
-@dataclass(frozen=True)
 class TrainPolicies(RobotTask):
     """Train the policies as `animat train` does by default, resuming where a killed run stopped."""
 
@@ -168,8 +165,6 @@ class TrainPolicies(RobotTask):
         return train_alone(work_on(training, members, timeline, self.path(folder, POLICIES), checkpoint), progress)
 
 
-@final
-@dataclass(frozen=True)
 class Judge(RobotTask):
     """Evaluate on the simulator: policies, controls, coupling, optimum, context gap and score, and whose work it is."""
 
@@ -186,8 +181,6 @@ class Judge(RobotTask):
         return [write_json(self.path(folder, SIMULATED), evaluation.to_dict())]
 
 
-@final
-@dataclass(frozen=True)
 class Measure(RobotTask):
     """Run in closed loop on the culture from where its recordings ended, controls between the policies' episodes."""
 
@@ -211,7 +204,7 @@ class Measure(RobotTask):
                 seed=self.seed_for("measure"),
                 pulse=stimuli.pulse,
                 patterns=stimuli.patterns,
-                # Best coupling, prediction, closed loop, optimal return.
+                # Best coupling, prediction, optimal return, closed loop.
                 progress=EqualPhases(progress, 4),
             )
         if gap.session.ending.by != "plan":

@@ -9,9 +9,10 @@ import numpy as np
 
 from animat.errors import counted
 from animat.lazy import Figure
+from animat.report.colours import BLACK, BLUE, GREY, ORANGE
 from animat.report.html import Columns, Section, Table, cell, columns_of, picture_of, table_of, write_page
 from animat.report.results import CONTEXT_GAP_LEVEL, ContextRow, LostRow
-from animat.report.style import BLACK, BLUE, GREY, ORANGE, add_common_legend, new_figure, save_formats, style_axes
+from animat.report.style import add_common_legend, new_figure, save_formats, style_axes
 from animat.studies.context import TABLE, WHOSE_WORK, ContextRun, ContextStudy
 from animat.studies.folder import REPORT
 

@@ -29,7 +29,7 @@ from animat.report.returns import draw_over_cultures
 from animat.report.style import save_formats
 from animat.studies.arms import arm_differences, arms_table, summarise_arms
 from animat.studies.folder import REPORT, RESULTS
-from animat.studies.results import read_typed, write_named_records, write_parquet, write_records
+from animat.studies.results import read_typed, write_of_cultures, write_parquet, write_records
 from animat.studies.run import StudyRun, run_study
 from animat.studies.source import read_seeds
 from animat.studies.specification import Compared, Study
@@ -45,13 +45,7 @@ MANIFEST = "cultures.json"
 
 @dataclass(frozen=True)
 class CulturesRun:
-    """Results of a run over cultures.
-
-    Attributes:
-        finished, failed: the finished cultures, and the errors of the others, by the names of their folders.
-        comparisons, summary: of each finished culture, and over all of them.
-        parquet: the scores as a Parquet table; None if fastparquet is missing.
-    """
+    """Results of each finished culture, errors of the others, and a summary; `parquet`: None without fastparquet."""
 
     folder: Path
     finished: dict[str, StudyRun]
@@ -85,8 +79,8 @@ def run_over_cultures(
     Recording a culture uses one core only; meanwhile the others do jobs of other cultures. If the study of a culture
     fails, the others continue, and the failure is reported at the end. More cultures may be added later.
 
-    Arguments and errors are those of `run_study`, for a study with `seeds` or `folders` in its culture; AnimatError is
-    raised if the study of every culture failed, with the error of each.
+    Arguments and errors are those of `run_study`, for a study with `seeds` or `folders` in its culture; AnimatError
+    also if the study of every culture failed.
     """
     expect_workers(workers, executor)
     folder = Path(folder).absolute()
@@ -109,10 +103,10 @@ def run_over_cultures(
         comparisons = {name: each.comparisons for name, each in results.items()}
         summary = tuple(over_cultures(list(comparisons.values())))
         scores = {name: each.scores for name, each in results.items()}
-        write_named_records(folder / COMPARISONS, comparisons, ComparedReturns, "culture")
+        write_of_cultures(folder / COMPARISONS, ComparedReturns, comparisons)
         write_records(folder / SUMMARY, OverCultures, summary)
-        write_named_records(folder / SCORES, scores, Score, "culture")
-        parquet = write_parquet((folder / SCORES).with_suffix(".parquet"), scores, Score, "culture")
+        write_of_cultures(folder / SCORES, Score, scores)
+        parquet = write_parquet((folder / SCORES).with_suffix(".parquet"), Score, scores)
     return CulturesRun(folder, finished, failed, comparisons, summary, parquet)
 
 

@@ -158,10 +158,7 @@ def _burst_rule(threshold: float | None, series: Sequence[Responses]) -> str:
 def differing_comparisons(
     rows: Sequence[ComparedReturns], lost: Mapping[float, float] | None = None
 ) -> Iterator[tuple[str, str]]:
-    """For each comparison that differs from the paper or is undecided: its outcome, and what the optima say about it.
-
-    `lost` is by how much binning moved P(x >= P50) of any condition, at most, by the recording's minute.
-    """
+    """What differs from the paper or is undecided, and why; `lost`: how far binning moved P(x >= P50), by minute."""
     for row in rows:
         if row.as_in_paper not in ("no", "cannot tell"):
             continue

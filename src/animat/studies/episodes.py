@@ -103,13 +103,7 @@ def goals_met(study: Study, table: DataFrame) -> Iterator[ObjectiveMet]:
 
 @dataclass(frozen=True, eq=False)
 class Paths:
-    """One episode of each of several actors.
-
-    Attributes:
-        observations: before each iteration and after the last, shape (actors, iterations + 1, observations).
-        commands: u of each iteration, shape (actors, iterations), or (actors, iterations, commands) for several.
-        lengths: iterations of each episode, shape (actors,); observations and commands beyond them are meaningless.
-    """
+    """One episode of each of several actors; observations and commands beyond its length are meaningless."""
 
     observations: Float[np.ndarray, "actors iterations+1 observations"]
     commands: Float[np.ndarray, "actors iterations *commands"]

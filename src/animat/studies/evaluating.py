@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple, final
+from typing import Any, NamedTuple
 
 from animat.environment import Environment
 from animat.evaluation.controls import controls_of
@@ -23,7 +23,6 @@ from animat.studies.training import training_of
 from animat.training.policy import Policy
 
 
-@final
 @dataclass(frozen=True)
 class Evaluate(StudyTask):
     """Run an arm's policies at the minutes of its comparisons, at every recording, and once to record paths."""
@@ -56,13 +55,11 @@ class Evaluate(StudyTask):
         ]
 
 
-@final
 @dataclass(frozen=True)
 class Control(StudyTask):
-    """Run the controls of a mapping on a robot: random, constant, heuristic; with policies also silent and shuffled.
+    """Run the controls of a mapping on a robot: that of the arm `plain`, whose policies are used if it `is_usual`.
 
     The best coupling is run at the last recording only, as its search takes as long as all other controls together.
-    The arm `plain` gives the mapping; its policies are used if it `is_usual`.
     """
 
     sizes = ("policies", "episodes", "episodes_over_time")

@@ -69,18 +69,14 @@ def hash_files(files: list[Path], base: Path) -> dict[str, str]:
     """SHA-256 of each file, by its path relative to `base`; CSV spikes include the file of their stimuli."""
     hashes: dict[str, str] = {}
     for file in files:
-        if _relative(file, base) in hashes:
-            raise InvalidArgument(f"culture.files: expected each file once, got {file} twice")
-        stimuli = stimuli_beside(file)
-        for each in [file] if stimuli is None else [file, stimuli]:
+        for each in filter(None, (file, stimuli_beside(file))):
+            # Relative where possible, so that a study and its files can be moved together.
+            name = (each.relative_to(base) if each.is_relative_to(base) else each).as_posix()
+            if name in hashes:
+                raise InvalidArgument(f"culture.files: expected each file once, got {each} twice")
             with as_invalid_file(each):
-                hashes[_relative(each, base)] = sha256(expect_plain_file(each))
+                hashes[name] = sha256(expect_plain_file(each))
     return dict(sorted(hashes.items()))
-
-
-def _relative(file: Path, base: Path) -> str:
-    """The path relative to `base` where possible, so that a study and its files can be moved together."""
-    return (file.relative_to(base) if file.is_relative_to(base) else file).as_posix()
 
 
 @contextmanager
@@ -94,17 +90,11 @@ def claim_folder(
 ) -> Iterator[None]:
     """Claim a folder for some work: lock out other runs, and delete what a killed run left unfinished.
 
-    Nothing in the folder is touched before it is known to be free or to belong to this work.
+    Nothing in it is touched before it is known to be free or to belong to this work (`what`, in messages), which the
+    manifest describes with a fingerprint. It is written to `file`, and further texts to files `beside` it, by name.
 
-    Args:
-        what: kind of work for messages, such as `study`.
-        manifest: description of the work, with a fingerprint, and the name of the `file` for it.
-        beside: text of further files, by their names.
-        own_folders: every folder that the work makes in its folder.
-
-    Raises:
-        Mismatch: if the folder belongs to other work, holds other files, or is in use by another run.
-        InvalidFile: if it cannot be read or created.
+    Raises Mismatch if the folder belongs to other work, holds other files, or is in use by another run, and InvalidFile
+    if it cannot be read or created.
     """
     expect_no_file(folder, f"the {what}")
     files = {file: json.dumps(manifest, indent=1, sort_keys=True) + "\n", **beside}

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, final
+from typing import Any
 
 from animat.environment import Animat
 from animat.evaluation.optimal_returns import WellSampled, undersampled
@@ -65,7 +65,6 @@ def missing_capabilities(study: Study) -> Iterator[str]:
         yield from lacks.values()
 
 
-@final
 @dataclass(frozen=True)
 class FindOptima(StudyTask):
     """Compute the optimal return on a robot for every mapping of the study, over conditions with enough responses.

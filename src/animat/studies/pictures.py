@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
-from typing import Any, final
+from typing import Any
 
 import numpy as np
 
@@ -46,9 +46,10 @@ from animat.tables import UNKNOWN
 from animat.training.settings import SAC
 from animat.training.specification import CHUNKS
 
+Rows = tuple[Sequence[str], Iterable[Sequence[Any]]]
+"""The head and the rows of a table."""
 
-@final
-@dataclass(frozen=True)
+
 class CulturePictures(StudyTask):
     """Draw the first recording and the series, and write their numbers to tables."""
 
@@ -66,23 +67,23 @@ class CulturePictures(StudyTask):
             "bursts": draw_burst_separation(responses),
             "responses": draw_response_histograms(responses, series[-1] if len(series) > 1 else None),
         }
-        tables = [
-            write_psth(folder, histogram, responses.window_ms, spontaneous_hz),
-            write_bursts(folder, series),
-            write_conditions(folder, series),
-        ]
+        tables = {
+            "psth": psth_rows(histogram, responses.window_ms, spontaneous_hz),
+            "bursts": bursts_rows(series),
+            "conditions": conditions_rows(series),
+        }
         progress.update(0.3, 1, "first recording")
         if first.channels.has_positions:
             figures["array"] = draw_array(first)
-            tables.append(write_array(folder, first))
+            tables["array"] = array_rows(first)
         if len(series) > 1:
             figures["over-time"] = draw_responses_over_time(series)
             figures["drift"] = draw_drift(series)
-            tables.append(write_drift(folder, series))
-        return tables + _save(folder, "culture", figures, progress)
+            head = ("at_min", *(f"p{percent}_hz" for percent in PERCENTILES), "burst_share")
+            tables["drift"] = head, drift_of(series).tolist()
+        return _save(folder, "culture", figures, tables, progress)
 
 
-@final
 @dataclass(frozen=True)
 class RobotPictures(StudyTask):
     """Draw learning, comparisons, returns over the recordings, controls, paths and frames of one robot."""
@@ -98,10 +99,10 @@ class RobotPictures(StudyTask):
         # For every recording, with the optimum on a coarse grid.
         coarse = References(study, folder, self.spec, table, over_time=True) if study.needs_neurons else known
         figures: dict[str, Figure] = {}
-        tables: list[Path] = []
+        tables: dict[str, Rows] = {}
         if curves := list(_curves(known, coarse, timeline)):
             figures["learning"] = draw_learning_curves(curves, f"{name}: learning")
-            tables.append(write_learning(folder, name, curves))
+            tables["learning"] = learning_rows(curves)
         if study.comparisons:
             pairs = [_pair(row, known) for row in results.comparisons if row.robot == name]
             figures["comparisons"] = draw_comparisons(pairs, f"{name}: comparisons")
@@ -109,24 +110,26 @@ class RobotPictures(StudyTask):
             courses = list(_courses(known, coarse, timeline))
             until_min = float(timeline.start_min[0]) + study.training_min
             figures["over-time"] = draw_over_time(courses, f"{name}: at every recording", trained_until_min=until_min)
-            tables.append(write_courses(folder, name, courses))
+            tables["over-time"] = courses_rows(courses)
         progress.update(0.2, 1, "controls")
         controls = _controls(row for row in results.controls if row.robot == name)
         figures["controls"] = draw_controls(list(controls), f"{name}: controls")
         files = {each.name: episodes_file(folder, self.spec, each, "paths") for each in study.arms}
         recorded = {arm: Paths(**read_arrays(file)) for arm, file in files.items()}
-        tables.append(write_paths(folder, name, [quantity.name for quantity in robot.observation_spec], recorded))
+        tables["paths"] = paths_rows([quantity.name for quantity in robot.observation_spec], recorded)
         paths = {arm: of.episodes() for arm, of in recorded.items()}
         lacks = lacking(robot)
         if "draw_paths" not in lacks:
             figures["paths"] = draw_paths(robot, paths, f"{name}: one episode of each policy")
         if "draw" not in lacks:
             figures["frames"] = draw_frames(robot, paths, f"{name}: the episode of median length of each arm")
-        return tables + _save(folder, name, figures, progress)
+        return _save(folder, name, figures, tables, progress)
 
 
-def _save(folder: Path, of: str, figures: Mapping[str, Figure], progress: Progress) -> list[Path]:
-    files = []
+def _save(
+    folder: Path, of: str, figures: Mapping[str, Figure], tables: Mapping[str, Rows], progress: Progress
+) -> list[Path]:
+    files = [write_table(table_file(folder, f"{of}-{name}"), head, rows) for name, (head, rows) in tables.items()]
     for i, (name, figure) in enumerate(figures.items()):
         progress.update(0.3 + 0.7 * i / len(figures), 1, name)
         files += save_formats(figure, folder, f"figures/{of}-{name}")
@@ -181,8 +184,7 @@ def _courses(known: References, coarse: References, timeline: SimulatorTimeline)
         random = np.array([coarse.random(kind, at_min) for at_min in every_min])
         optimum = np.array([coarse.best_return(kind, at_min) for at_min in every_min], np.float64)
         fine = {at_min: best for at_min in every_min if (best := known.best_return(kind, at_min)) is not None}
-        values = optimum if np.isfinite(optimum).any() else None
-        yield Courses(mapping_label(*kind.kind), timeline.start_min, returns, random, values, fine)
+        yield Courses(mapping_label(*kind.kind), timeline.start_min, returns, random, optimum, fine)
 
 
 def _controls(rows: Iterable[ControlReturns]) -> Iterator[tuple[str, list[ControlReturns]]]:
@@ -192,22 +194,20 @@ def _controls(rows: Iterable[ControlReturns]) -> Iterator[tuple[str, list[Contro
         yield f"{mapping_label(mapping, percentiles)}{at}", list(same)
 
 
-def write_psth(
-    folder: Path, histogram: PostStimulusHistogram, window_ms: tuple[float, float], spontaneous_hz: float
-) -> Path:
+def psth_rows(histogram: PostStimulusHistogram, window_ms: Sequence[float], quiet_hz: float) -> Rows:
     """The histogram of the first recording, one row per bin; `in_window`: the bin's share in the response window."""
     from_ms, to_ms = histogram.edges_ms[:-1], histogram.edges_ms[1:]
     inside_ms = np.clip(np.minimum(to_ms, window_ms[1]) - np.maximum(from_ms, window_ms[0]), 0.0, None)
     head = ("from_ms", "to_ms", "in_window", "spikes", "stimuli", "channels", "rate_hz_per_channel")
     columns = (from_ms, to_ms, inside_ms / (to_ms - from_ms), histogram.count, histogram.rate_hz)
     rows = (
-        (*bounds, inside, count, histogram.n_stimuli, histogram.n_channels, rate_hz, spontaneous_hz)
+        (*bounds, inside, count, histogram.n_stimuli, histogram.n_channels, rate_hz, quiet_hz)
         for *bounds, inside, count, rate_hz in zip(*(column.tolist() for column in columns), strict=True)
     )
-    return _write(folder, "culture-psth", (*head, "spontaneous_hz_per_channel"), rows)
+    return (*head, "spontaneous_hz_per_channel"), rows
 
 
-def write_bursts(folder: Path, series: Sequence[Responses]) -> Path:
+def bursts_rows(series: Sequence[Responses]) -> Rows:
     """Burst separation in every recording; a response whose ratio of active channels is above the threshold is one."""
     head = ("at_min", "responses", "bursts", "burst_share", "threshold_active_ratio", "separability", "channels")
     rows = []
@@ -215,10 +215,10 @@ def write_bursts(folder: Path, series: Sequence[Responses]) -> Path:
         n, bursts = len(responses), int(np.count_nonzero(responses.is_burst))
         counts = (responses.start_min, n, bursts, bursts / n if n else None)
         rows.append((*counts, responses.threshold, responses.separability, responses.n_channels))
-    return _write(folder, "culture-bursts", head, rows)
+    return head, rows
 
 
-def write_conditions(folder: Path, series: Sequence[Responses]) -> Path:
+def conditions_rows(series: Sequence[Responses]) -> Rows:
     """The non-burst responses to every condition in every recording: how many, median, and P(x >= P50 of all)."""
     head = ("at_min", "condition", "value", "unit", "non_bursts", "median_hz", "above_median")
     rows = []
@@ -227,16 +227,10 @@ def write_conditions(folder: Path, series: Sequence[Responses]) -> Path:
             condition, x = responses.conditions[i], responses.rates_of(i)
             of_condition = condition.label, condition.value, condition.unit
             rows.append((responses.start_min, *of_condition, len(x), float(np.median(x)) if len(x) else None, share))
-    return _write(folder, "culture-conditions", head, rows)
+    return head, rows
 
 
-def write_drift(folder: Path, series: Sequence[Responses]) -> Path:
-    """Percentiles of the non-burst responses to all conditions, and the share of bursts, at every recording."""
-    head = ("at_min", *(f"p{percent}_hz" for percent in PERCENTILES), "burst_share")
-    return _write(folder, "culture-drift", head, drift_of(series).tolist())
-
-
-def write_array(folder: Path, recording: Recording) -> Path:
+def array_rows(recording: Recording) -> Rows:
     """Every recording site of the first recording with its rate, and stimulated electrodes that no channel reads."""
     channels, electrodes = recording.channels, recording.stimuli.electrodes
     stimulated = set(electrodes[electrodes != UNKNOWN].tolist())
@@ -247,36 +241,33 @@ def write_array(folder: Path, recording: Recording) -> Path:
     ]
     unread = sorted(stimulated - set(channels.electrode.tolist()))
     rows += [(None, electrode, None, None, None, 1) for electrode in unread]
-    return _write(folder, "culture-array", ("channel", "electrode", "x_um", "y_um", "rate_hz", "is_stimulated"), rows)
+    return ("channel", "electrode", "x_um", "y_um", "rate_hz", "is_stimulated"), rows
 
 
-def write_learning(folder: Path, robot: str, curves: Sequence[LearningCurve]) -> Path:
+def learning_rows(curves: Sequence[LearningCurve]) -> Rows:
     """Learning curves as means over policies with their 95 % intervals, with random actions and the optimum."""
     head = ("arm", "iterations", "policies", "mean_return", "low_95", "high_95", "random", "optimum")
     rows: list[tuple[Any, ...]] = []
     for curve in curves:
-        ended = np.count_nonzero(np.isfinite(curve.returns), axis=0).tolist()
-        interval = (column.tolist() for column in curve.mean_with_interval())
-        levels = ([None] * len(ended) if each is None else each.tolist() for each in (curve.random, curve.optimum))
-        iterations = (int(done) for done in curve.iterations)
-        rows += [(curve.name, *row) for row in zip(iterations, ended, *interval, *levels, strict=True)]
-    return _write(folder, f"{robot}-learning", head, rows)
+        ended = np.count_nonzero(np.isfinite(curve.returns), axis=0)
+        columns = (curve.iterations.astype(int), ended, *curve.mean_with_interval(), curve.random, curve.optimum)
+        rows += [(curve.name, *row) for row in zip(*(column.tolist() for column in columns), strict=True)]
+    return head, rows
 
 
-def write_courses(folder: Path, robot: str, panels: Sequence[Courses]) -> Path:
+def courses_rows(panels: Sequence[Courses]) -> Rows:
     """Quartiles over policies of every arm at every recording, with random actions and the optima."""
     head = ("mapping", "arm", "at_min", "policies", "lower_quartile", "median", "upper_quartile", "random")
     rows = []
     for panel in panels:
         for arm, returns in panel.returns.items():
-            for i, at_min in enumerate(panel.minutes.tolist()):
-                levels = (None if each is None else float(each[i]) for each in (panel.random, panel.optimum))
-                known = panel.title, arm, at_min, len(returns), *panel.quartiles(arm)[:, i].tolist()
-                rows.append((*known, *levels, panel.fine_optimum.get(at_min)))
-    return _write(folder, f"{robot}-over-time", (*head, "optimum_rough_grid", "optimum_fine_grid"), rows)
+            columns = (panel.minutes, *panel.quartiles(arm), panel.random, panel.optimum)
+            for at_min, *levels in zip(*(column.tolist() for column in columns), strict=True):
+                rows.append((panel.title, arm, at_min, len(returns), *levels, panel.fine_optimum.get(at_min)))
+    return (*head, "optimum_rough_grid", "optimum_fine_grid"), rows
 
 
-def write_paths(folder: Path, robot: str, names: Sequence[str], paths: Mapping[str, Paths]) -> Path:
+def paths_rows(names: Sequence[str], paths: Mapping[str, Paths]) -> Rows:
     """One episode of each policy of every arm: observations, and the command or commands that led to each."""
     n = max(math.prod(of.commands.shape[2:]) for of in paths.values())
     heads = ["command"] if n == 1 else [f"command_{number}" for number in range(1, n + 1)]
@@ -286,10 +277,4 @@ def write_paths(folder: Path, robot: str, names: Sequence[str], paths: Mapping[s
         for actor, (observations, commands) in enumerate(of.episodes())
         for i, observed in enumerate(observations)
     )
-    return _write(folder, f"{robot}-paths", ("arm", "policy", "iteration", *names, *heads), rows)
-
-
-def _write(folder: Path, name: str, head: Sequence[str], rows: Iterable[Sequence[Any]]) -> Path:
-    """Write a table with NaN as empty cells."""
-    known = ([None if isinstance(cell, float) and math.isnan(cell) else cell for cell in row] for row in rows)
-    return write_table(table_file(folder, name), head, known)
+    return ("arm", "policy", "iteration", *names, *heads), rows

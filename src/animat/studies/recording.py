@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import final
 
 from animat.cultures.series import SELECTION_FILE, STATE_FILE, record_series
 from animat.cultures.virtual import VirtualCulture
@@ -28,7 +27,6 @@ from animat.studies.task import StudyTask
 JOB = "record"
 
 
-@final
 @dataclass(frozen=True)
 class Record(StudyTask):
     """Make the recordings as NWB; the specification's file names are relative to `base`."""
@@ -74,8 +72,6 @@ class Record(StudyTask):
         return copies
 
 
-@final
-@dataclass(frozen=True)
 class Fit(StudyTask):
     """Extract the responses of all recordings and fit a simulator to each."""
 
@@ -84,25 +80,21 @@ class Fit(StudyTask):
     def make(self, folder: Path, progress: Progress) -> list[Path]:
         study, series = self.study, read_series(self.study, folder)
         timeline = fit_simulators(study, series)
-        if len(timeline.conditions) < 2 and "one-condition" not in study.simulators.allow:
-            raise UnusableData(
-                f"{one_condition(timeline)}; sort the stimuli by frequency, interval:5,10, electrode or pattern "
-                '(to allow it: simulators.allow = ["one-condition"])'
-            )
         timeline = replace(timeline, findings=(*timeline.findings, *_moved(study, timeline.start_min.tolist())))
         return [save_timeline(timeline, folder / TIMELINE), _write_responses(folder / RESPONSES, series)]
 
 
 def fit_simulators(study: Study, series: list[Responses]) -> SimulatorTimeline:
-    """Fit simulators to responses with a study's settings."""
+    """Fit simulators to responses with a study's settings; UnusableData for only one condition, unless allowed."""
     settings = study.simulators
-    return fit_timeline(series, kind=settings.kind, bins=settings.bins, range_hz=settings.range_hz)
-
-
-def one_condition(timeline: SimulatorTimeline) -> str:
-    """The beginning of an error message for simulators with only one condition."""
-    only = timeline.conditions[0].label
-    return f"simulators.conditions: expected two or more for an agent to choose from, got one ({only})"
+    timeline = fit_timeline(series, kind=settings.kind, bins=settings.bins, range_hz=settings.range_hz)
+    if len(timeline.conditions) < 2 and "one-condition" not in settings.allow:
+        raise UnusableData(
+            "simulators.conditions: expected two or more for an agent to choose from, got one "
+            f"({timeline.conditions[0].label}); sort the stimuli by frequency, interval:5,10, electrode or pattern "
+            '(to allow it: simulators.allow = ["one-condition"])'
+        )
+    return timeline
 
 
 def _write_responses(path: Path, series: list[Responses]) -> Path:

@@ -52,11 +52,12 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
 
 
 def write_table(path: Path, head: Sequence[str], rows: Iterable[Sequence[Any]]) -> Path:
-    """Write a CSV file atomically; numbers with all digits, None as an empty cell."""
+    """Write a CSV file atomically; numbers with all digits, None and NaN as empty cells."""
+    known = ([None if cell != cell else cell for cell in row] for row in rows)
     with atomic_write(path) as beside, beside.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(head)
-        writer.writerows(rows)
+        writer.writerows(known)
     return path
 
 
@@ -65,29 +66,28 @@ def write_records(path: Path, kind: type, rows: Iterable[Any]) -> Path:
     return write_table(path, [field.name for field in fields(kind)], (astuple(row) for row in rows))
 
 
-def write_named_records(path: Path, named: Mapping[str, Iterable[Any]], kind: type, name: str) -> Path:
-    """Write records as a CSV file with an extra first column `name`, whose value is the key of each record."""
-    head = [name, *(field.name for field in fields(kind))]
-    return write_table(path, head, ((first, *astuple(row)) for first, rows in named.items() for row in rows))
+def write_of_cultures(path: Path, kind: type, of_each: Mapping[str, Iterable[Any]]) -> Path:
+    """Write the records of each culture, by its name, as a CSV file with `culture` as its first column."""
+    rows = ((culture, *astuple(row)) for culture, rows in of_each.items() for row in rows)
+    return write_table(path, ["culture", *(field.name for field in fields(kind))], rows)
 
 
 MISSING = f"fastparquet is not installed: {install_command('parquet')}"
 
 
-def write_parquet(path: Path, named: Mapping[str, Sequence[Any]], kind: type, name: str) -> Path | None:
-    """Write records as `write_named_records` does, with None as NaN; returns None if fastparquet is missing."""
+def write_parquet(path: Path, kind: type, of_each: Mapping[str, Sequence[Any]]) -> Path | None:
+    """Write records as `write_of_cultures` does, with None as NaN; returns None if fastparquet is missing."""
     try:
         import fastparquet
     except ImportError:
         return None
     import pandas as pd
 
-    hints = get_type_hints(kind)
     dtypes = {int: "int64", str: object, str | None: object}
-    columns = {name: pd.Series([first for first, rows in named.items() for _ in rows], dtype=object)}
-    for each in fields(kind):
-        values = [getattr(row, each.name) for rows in named.values() for row in rows]
-        columns[each.name] = pd.Series(values, dtype=dtypes.get(hints[each.name], "float64"))
+    columns = {"culture": pd.Series([culture for culture, rows in of_each.items() for _ in rows], dtype=object)}
+    for name, hint in get_type_hints(kind).items():
+        values = [getattr(row, name) for rows in of_each.values() for row in rows]
+        columns[name] = pd.Series(values, dtype=dtypes.get(hint, "float64"))
     encodings = {column: "utf8" if values.dtype == object else "infer" for column, values in columns.items()}
     with atomic_write(path) as beside:
         fastparquet.write(str(beside), pd.DataFrame(columns), object_encoding=encodings, write_index=False)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
-from typing import Any, final, get_args, get_type_hints
+from typing import Any, get_args, get_type_hints
 
 import numpy as np
 from jaxtyping import Float64
@@ -35,8 +35,6 @@ LEFT_OUT = "left-out"
 """The finding that the study lacks something, as a robot cannot do it."""
 
 
-@final
-@dataclass(frozen=True)
 class Tabulate(StudyTask):
     """Summarise the table of episodes and write `tables/`: typed results for later tasks, and everything as CSV."""
 
@@ -281,5 +279,4 @@ def _curves(study: Study, folder: Path) -> Iterator[tuple[Any, ...]]:
         for arm in (arm for arm in study.arms if arm.trained):
             for i, curve in enumerate(learning_of(study, folder, spec, arm).tolist()):
                 for iterations, episodes, mean in curve:
-                    row = int(iterations), int(episodes), None if np.isnan(mean) else mean
-                    yield spec.name, arm.name, f"p{i}", *row
+                    yield spec.name, arm.name, f"p{i}", int(iterations), int(episodes), mean

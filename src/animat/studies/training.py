@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import final
 
 from animat.coding.mapping import mapping_named
 from animat.devices import gpu_here
@@ -21,7 +20,6 @@ from animat.training.settings import SAC
 from animat.training.specification import Training
 
 
-@final
 @dataclass(frozen=True)
 class TrainGroup(StudyTask, TrainingTask):
     """Train some policies of an arm on a robot, resuming where a killed run stopped."""

@@ -12,19 +12,8 @@ from statistics import fmean, stdev
 from typing import Any
 
 from animat.lazy import Figure
-from animat.report.style import (
-    BLACK,
-    BLUE,
-    GREY,
-    ORANGE,
-    PURPLE,
-    RED,
-    SKY,
-    add_common_legend,
-    new_figure,
-    save_figure,
-    style_axes,
-)
+from animat.report.colours import BLACK, BLUE, GREY, ORANGE, PURPLE, RED, SKY
+from animat.report.style import add_common_legend, new_figure, save_figure, style_axes
 from animat.studies.folder import RECORDINGS
 from animat.studies.toml import study_to_toml
 from animat.tuning.search import TrialResult, importance_of
@@ -37,11 +26,9 @@ _MARKERS = "ov^sDP"
 
 @dataclass(frozen=True)
 class Final:
-    """Settings that were retrained at the end.
+    """Settings that were retrained at the end, and the trial that tried them first (0: the study's own settings).
 
-    Attributes:
-        trial: the trial that tried them first; 0: the study's own settings.
-        returns: mean return of each policy in fresh episodes; None if a policy's parameters were not finite.
+    `returns` are each policy's mean return in fresh episodes; None if a policy's parameters were not finite.
     """
 
     trial: int
@@ -63,11 +50,9 @@ class Final:
 
 @dataclass(frozen=True)
 class TuningResult:
-    """The outcome of a tuning.
+    """The outcome of a tuning; in `finals` the study's own settings, the defaults if tried, then the best trials.
 
-    Attributes:
-        finals: the study's own settings, the defaults if they were tried, then the best trials, best first.
-        importance: share of each setting, the largest first; empty for fewer than four trials.
+    `importance` is the share of each setting, the largest first; empty for fewer than four trials.
     """
 
     folder: Path

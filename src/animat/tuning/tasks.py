@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any, final
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,12 +18,11 @@ from jaxtyping import Array
 
 from animat.compilation import jit_side_by_side
 from animat.environment import Environment
-from animat.errors import UnusableData
 from animat.evaluation.rollouts import Networks, roll_out
 from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import SimulatorTimeline, load_timeline, save_timeline
 from animat.progress import Progress
-from animat.studies.recording import fit_simulators, one_condition, read_series
+from animat.studies.recording import fit_simulators, read_series
 from animat.studies.specification import Study
 from animat.studies.task import StudyTask
 from animat.studies.training import training_of
@@ -46,8 +45,6 @@ def timeline_file(study: Study) -> Path:
     return Path("simulators") / f"{simulators.kind}{details and '-' + digest}.safetensors"
 
 
-@final
-@dataclass(frozen=True)
 class Fit(StudyTask):
     """Fit a simulator of the study's kind to the responses of each recording."""
 
@@ -55,8 +52,6 @@ class Fit(StudyTask):
 
     def make(self, folder: Path, progress: Progress) -> list[Path]:
         timeline = fit_simulators(self.study, read_series(self.study, folder))
-        if len(timeline.conditions) < 2:
-            raise UnusableData(one_condition(timeline))
         return [save_timeline(timeline, folder / timeline_file(self.study))]
 
 
@@ -90,13 +85,9 @@ def programs(environment: Environment[Any], algorithm: SAC) -> tuple[Callable[..
 
 
 class Trials(SideBySide):
-    """The policies of several trials during training, one group per trial.
+    """The policies of several trials during training, one group per trial; their settings differ only in `NUMBERS`.
 
-    Args:
-        training: the training of all trials, except for the settings in `NUMBERS`.
-        timeline: the simulators they are trained on; None without neurons.
-        algorithms: settings of each trial, which differ only in `NUMBERS`.
-        members: numbers of each trial's policies, which decide their random numbers: all trials use the same ones.
+    The numbers of each trial's policies, `members`, decide their random numbers: all trials use the same ones.
     """
 
     def __init__(
@@ -123,7 +114,6 @@ class Trials(SideBySide):
         return Networks(network, scales, greedy)
 
 
-@final
 @dataclass(frozen=True)
 class TrainTrials(StudyTask):
     """Train trials of equal shape side by side, from one rung to the next, and evaluate them.
@@ -132,7 +122,6 @@ class TrainTrials(StudyTask):
     that is easiest to control would win. All trials use the same random numbers.
 
     Attributes:
-        members: numbers of the trials' policies.
         seeds: of training and, for the group of the first policies, of the episodes.
         chunks: the chunks of training, from the first up to but excluding the last.
         place: folder of the returns and, up to the end of training, of the learners, relative to the tuning's.

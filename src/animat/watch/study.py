@@ -123,10 +123,8 @@ def _results_of(path: Path) -> list[list[Any]]:
             raise InvalidFile(f"{path}: expected the episodes of an arm")
         returns, actors, over_time, agents, at_min = arrays
         # Episodes over time are few per recording, and a comparison's episodes may be on another recording.
-        own = ~over_time.astype(bool) & (agents == "policy") & (at_min == at_min.max(initial=-np.inf))
-        return (
-            [[robot, arm, float(returns[own].mean()), len(np.unique(actors[own])), int(own.sum())]] if own.any() else []
-        )
+        own = ~over_time.astype(bool) & (agents == "policy") & (at_min == at_min.max())
+        return [[robot, arm, float(returns[own].mean()), len(np.unique(actors[own])), int(own.sum())]]
     culture, robot = robot, arm
     rows = json_of(path)["rows"][:1]
     return [[robot, f"policies, {culture}", row["mean_return"], row["actors"], row["episodes"]] for row in rows]

@@ -146,14 +146,12 @@ class Tail:
 
 
 class Sums:
-    """The totals of a log's records counted so far.
+    """The totals of a log's records counted so far; `strange` are those that are not understood.
 
     Attributes:
         totals: for each record the return of its episode so far; NaN without a tick.
         wall_s: of the last tick, on the program's clock; None before the first.
         faults: the last ones: when, on the session's clock, and what happened.
-        percentiles: the thresholds since each change.
-        strange: number of records that are not understood.
     """
 
     def __init__(self, tail: Tail) -> None:

@@ -11,8 +11,8 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from animat.closed_loop.runner import HostRunner
+from animat.report.colours import BLUE, ORANGE, RED, condition_colours
 from animat.report.film.scene import Moment, Scene
-from animat.report.style import BLUE, ORANGE, RED, condition_colours
 from animat.robots.drawing import Picture, draw_robot
 from animat.robots.host import HostRobot
 

@@ -17,13 +17,12 @@ class Moment:
     """The state from one time on.
 
     Attributes:
-        iteration: of the robot; -1 before it moves.
+        iteration: -1 before the robot moves.
         turn: number that decides how the episode starts.
-        observation: in the robot's units; empty if it was not recorded.
+        observation: empty if it was not recorded.
         command: that led to this state; None if the robot was not moved.
         total: sum of the episode's rewards so far.
-        delivered: label of the condition that was delivered; "" for none.
-        rate_hz: the response; NaN if nothing was read.
+        delivered, rate_hz: the condition's label, and the response; "" and NaN for none.
     """
 
     time_s: float
@@ -44,7 +43,6 @@ class Scene:
 
     Attributes:
         moments: in order of time; those of the first episode from its start, so that a host robot can be replayed.
-        spike_times_s, spike_channels: recorded spikes, in order of time.
         n_channels: of the array; 0 without an array, when only responses are shown.
         lost_bytes: bytes at the end of a session's log that are torn or damaged and not shown.
         runner_seed: of the runner that moved a host robot (`animat.closed_loop.runner.HostRunner`).

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -113,17 +114,14 @@ class _Reading:
             self.moments.append(Moment(tick.read_after_s, tick.agent, tick.episode, -1, turn, start))
             self._turns[tick.agent] += 1
         before = self.moments[-1]
-        self.moments.append(
-            Moment(
-                time_s=tick.read_after_s + self._window_s,
-                agent=tick.agent,
-                episode=tick.episode,
-                iteration=tick.iteration,
-                turn=before.turn,
-                observation=tick.observation or before.observation,
-                command=tick.command,
-                total=before.total + (tick.reward or 0.0),
-                delivered=self._conditions[tick.delivered] if tick.pulse_time_s else "",
-                rate_hz=tick.rate_hz,
-            )
+        moment = replace(
+            before,
+            time_s=tick.read_after_s + self._window_s,
+            iteration=tick.iteration,
+            observation=tick.observation or before.observation,
+            command=tick.command,
+            total=before.total + (tick.reward or 0.0),
+            delivered=self._conditions[tick.delivered] if tick.pulse_time_s else "",
+            rate_hz=tick.rate_hz,
         )
+        self.moments.append(moment)
