@@ -33,7 +33,6 @@ from animat.ctrl_c import KILLS, handled
 from animat.cultures.base import Culture
 from animat.cultures.budget import Account
 from animat.cultures.failures import describe_error
-from animat.cultures.observed import more_left_out
 from animat.errors import AnimatError, InvalidArgument, Mismatch, expect_at_least, shown, some_of
 from animat.evaluation.statistics import Interval
 from animat.progress import Progress, Silent
@@ -242,7 +241,7 @@ class _Supervisor:
         left_out: dict[str, int] = {}
         # A culture that is gone may not be able to count.
         with suppress(Exception):
-            left_out = more_left_out(self._left_out, self._culture.left_out)
+            left_out = Counter(self._culture.left_out) - Counter(self._left_out)
         try:
             # Read before writing: if the robot answers just now, its finished tick is among the written records.
             unfinished = self._driver.unfinished

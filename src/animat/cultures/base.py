@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -15,9 +16,9 @@ import numpy as np
 from jaxtyping import Int64
 
 from animat.cultures.failures import as_device_failure
-from animat.cultures.observed import Observed, Spikes, assemble, more_left_out, with_rests
+from animat.cultures.observed import Observed, Spikes, assemble, with_rests
 from animat.cultures.openable import Openable
-from animat.cultures.safety import SIMULATED_LIMITS, Admitted, Limits
+from animat.cultures.safety import SIMULATED_LIMITS, Admitted
 from animat.errors import AnimatError, InvalidArgument, expect_kind, some_of
 from animat.progress import Progress, Silent
 from animat.recordings.recorded_culture import RecordedCulture
@@ -256,7 +257,7 @@ class Culture(Openable):
                     seen_s = self.now_s
                     follow(so_far)
                     followed_s = self.now_s - seen_s
-        if more := more_left_out(before, self.left_out):
+        if more := Counter(self.left_out) - Counter(before):
             provenance["left_out"] = ", ".join(f"{count} {what}" for what, count in more.items())
         return so_far()
 
@@ -297,10 +298,7 @@ class ComputedCulture(Culture):
     """A culture that a program computes: a delivery ends within its call; reopened, it continues where it was."""
 
     ends_within_s: ClassVar[float] = -1
-
-    @property
-    def device_limits(self) -> Limits:
-        return SIMULATED_LIMITS
+    device_limits = SIMULATED_LIMITS
 
     def _halt(self) -> None:
         """Do nothing: the guard refuses the next delivery."""

@@ -89,58 +89,40 @@ class Limits:
             UnsafeStimulus: unless the pulse is within the limits, both as requested and as rounded.
         """
         if pulse.kind != self.kind:
-            raise UnsafeStimulus(
-                "kind",
-                f"expected a {self.kind} pulse, which this kind of culture takes, got a {pulse.kind} pulse ({pulse})",
-                argument="pulse",
-            )
-        if len(pulse.phases) > self.phases_per_pulse:
-            raise UnsafeStimulus(
-                "phases_per_pulse",
-                f"expected at most {self.phases_per_pulse} phases in a pulse, got {len(pulse.phases)} ({pulse})",
-            )
-        for phase in pulse.phases:
-            shortest, longest = self.phase_us
-            if not shortest <= phase.duration_us <= longest:
-                raise UnsafeStimulus(
-                    "phase_us", f"expected phases of {shortest:g} to {longest:g} us, got {phase.duration_us:g}"
-                )
-            if not is_multiple(phase.duration_us, self.phase_step_us):
-                raise UnsafeStimulus(
-                    "phase_step_us",
-                    f"expected phases in steps of {self.phase_step_us:g} us, got {phase.duration_us:g}: round it",
-                )
+            expected = f"expected a {self.kind} pulse, which this kind of culture takes"
+            raise UnsafeStimulus("kind", f"{expected}, got a {pulse.kind} pulse ({pulse})", argument="pulse")
+        n, most, (shortest, longest), step = len(pulse.phases), self.phases_per_pulse, self.phase_us, self.phase_step_us
+        _expect("phases_per_pulse", n <= most, f"at most {most} phases in a pulse", f"{n} ({pulse})")
+        for us in (phase.duration_us for phase in pulse.phases):
+            _expect("phase_us", shortest <= us <= longest, f"phases of {shortest:g} to {longest:g} us", f"{us:g}")
+            _expect("phase_step_us", is_multiple(us, step), f"phases in steps of {step:g} us", f"{us:g}: round it")
         self._check_shape(pulse)
-        made, charge_unit = delivered_pulse(pulse, self.amplitude_step), self.units[1]
+        made, unit = delivered_pulse(pulse, self.amplitude_step), self.units[1]
         rounding = "" if made == pulse else f", which the device makes of {pulse}"
         self._check_shape(made, rounding)
-        for phase in made.phases:
-            if not abs(phase.charge) <= self.charge_per_phase:
-                raise UnsafeStimulus(
-                    "charge_per_phase",
-                    f"expected -{self.charge_per_phase:g} to {self.charge_per_phase:g} {charge_unit} per phase, "
-                    f"got {phase.charge:g}{rounding}: lower the amplitude or shorten the phase",
-                )
-        if not abs(made.net_charge) <= self.net_charge:
-            raise UnsafeStimulus(
-                "net_charge",
-                f"expected phases that balance to within {self.net_charge:g} {charge_unit}, got {made.net_charge:g} "
-                f"({made}{rounding}): give the phases equal and opposite charge",
-            )
+        for charge in (phase.charge for phase in made.phases):
+            expected = f"-{self.charge_per_phase:g} to {self.charge_per_phase:g} {unit} per phase"
+            got = f"{charge:g}{rounding}: lower the amplitude or shorten the phase"
+            _expect("charge_per_phase", abs(charge) <= self.charge_per_phase, expected, got)
+        expected = f"phases that balance to within {self.net_charge:g} {unit}"
+        got = f"{made.net_charge:g} ({made}{rounding}): give the phases equal and opposite charge"
+        _expect("net_charge", abs(made.net_charge) <= self.net_charge, expected, got)
         return made.net_charge
 
     def _check_shape(self, pulse: Pulse, rounding: str = "") -> None:
         """Check the limits on amplitudes and signs."""
-        for phase in pulse.phases:
-            if not abs(phase.amplitude) <= self.amplitude:
-                raise UnsafeStimulus(
-                    "amplitude",
-                    f"expected -{self.amplitude:g} to {self.amplitude:g} {self.units[0]}, got {phase.amplitude:g}"
-                    f"{rounding}: give the pulse a smaller amplitude",
-                )
+        expected = f"-{self.amplitude:g} to {self.amplitude:g} {self.units[0]}"
+        for amplitude in (phase.amplitude for phase in pulse.phases):
+            got = f"{amplitude:g}{rounding}: give the pulse a smaller amplitude"
+            _expect("amplitude", abs(amplitude) <= self.amplitude, expected, got)
         signs = [sign_of(phase.amplitude) for phase in pulse.phases]
-        if self.alternates and any(before == after for before, after in pairwise(signs)):
-            raise UnsafeStimulus("alternates", f"expected successive phases of different signs, got {pulse}{rounding}")
+        is_alternating = not self.alternates or all(before != after for before, after in pairwise(signs))
+        _expect("alternates", is_alternating, "successive phases of different signs", f"{pulse}{rounding}")
+
+
+def _expect(limit: str, is_kept: bool, expected: str, got: str) -> None:
+    if not is_kept:
+        raise UnsafeStimulus(limit, f"expected {expected}, got {got}")
 
 
 def plain_limits(limits: Limits) -> Limits:

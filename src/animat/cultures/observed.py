@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple
 
@@ -101,8 +101,3 @@ def assemble(schedule: Schedule, observed: Sequence[Observed], *, sampling_rate_
         protocol=schedule.protocol,
         **about,
     )
-
-
-def more_left_out(before: Mapping[str, int], after: Mapping[str, int]) -> dict[str, int]:
-    """The counts left out between two readings that are not zero."""
-    return {what: more for what, count in after.items() if (more := count - before.get(what, 0))}

@@ -80,6 +80,8 @@ class CL1Culture(Culture):
 
     name: ClassVar[str] = "cl1"
     sampling_rate_hz = float(FRAMES_PER_S)
+    stimulation_electrodes = SITES
+    device_limits = CL1_LIMITS
 
     def __init__(
         self,
@@ -123,10 +125,6 @@ class CL1Culture(Culture):
         return self._channels
 
     @property
-    def stimulation_electrodes(self) -> tuple[int, ...]:
-        return SITES
-
-    @property
     def patterns(self) -> Int64[np.ndarray, "patterns size"]:
         return self._patterns
 
@@ -134,10 +132,6 @@ class CL1Culture(Culture):
     def device(self) -> Path:
         """The CL1 on this machine; each program has its own SDK simulator."""
         return of_the_program("cl1-simulator") if _sdk().is_simulator() else of_the_machine("cl1")
-
-    @property
-    def device_limits(self) -> Limits:
-        return CL1_LIMITS
 
     @property
     def now_s(self) -> float:
