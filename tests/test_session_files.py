@@ -209,8 +209,8 @@ def test_spikes_that_cannot_be_are_refused_in_blocks_too(
         Stimuli(*np.empty((3, 0)), np.empty((0, 1)), np.empty(0)), 20.0, 0.0, 2.0,  # type: ignore[arg-type]
     )  # fmt: skip
     spikes, counts = (np.array([0.1, time_s]), np.array([0, channel])), SpikeCounts(6)
-    counts.add(*spikes)
     with pytest.raises(UnusableData, match=words):
+        counts.add(*spikes)
         write_nwb(empty, tmp_path / "a.nwb", [spikes], counts)
     assert not list(tmp_path.iterdir())
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from animat.closed_loop.header import Header, read_header
-from animat.closed_loop.log import Log, Record, open_file, read_log
+from animat.closed_loop.log import Log, open_file, read_log
 from animat.closed_loop.outline import Episode, Outline, count_electrode_pulses
 from animat.closed_loop.tick import STOP_FILE, Ending, Tick, TickTable
 from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch
@@ -58,10 +58,8 @@ class SessionData:
         self._electrodes, self._widths = array("q"), array("q")
         self._watched_s = self._end_s = 0.0
 
-    def add(self, record: Record) -> None:
-        fields = record.fields
+    def add(self, fields: Mapping[str, Any]) -> None:
         self.outline.add(fields)
-        self.spike_counts.add(record.spike_times_s, record.spike_channels)
         if fields["kind"] != "seen":
             return
         for frequency_hz, pattern, presentation, electrodes in fields["stimuli"]:
@@ -210,12 +208,14 @@ class Session:
     def _collect(self, table: TickTable | None = None, progress: Progress | None = None) -> SessionData:
         """Read all records once, and write their ticks into a table."""
         data = SessionData(self._header)
-        for number, record in enumerate(self.log):
-            data.add(record)
-            if table is not None and record.fields["kind"] == "seen" and record.fields["tick"]:
-                table.add({**record.fields["tick"], "electrode_pulses": count_electrode_pulses(record.fields)})
+        for number, fields in enumerate(self.log.fields()):
+            data.add(fields)
+            if table is not None and fields["kind"] == "seen" and fields["tick"]:
+                table.add({**fields["tick"], "electrode_pulses": count_electrode_pulses(fields)})
             if progress is not None and number % _UPDATE_EVERY == 0:
                 progress.update(number, len(self.log))
+        for block in self.log.spike_blocks():
+            data.spike_counts.add(*block)
         return data
 
 

@@ -13,52 +13,32 @@ from animat.errors import UnusableData
 SpikeBlock = tuple[Float64[np.ndarray, " spikes"], Int[np.ndarray, " spikes"]]
 """Times in s and channels of a block of spikes."""
 
-_COUNTED_AT_ONCE = 2**14
-
 
 class SpikeCounts:
-    """Counts the spikes of each of some channels incrementally."""
+    """How many spikes each of some channels has, and the earliest and the latest time, added block by block.
+
+    Attributes:
+        of_channels: shape (channels,).
+        span_s: 0 and 0 if there are no spikes.
+    """
 
     def __init__(self, channels: int) -> None:
-        self._counts = np.zeros(channels, np.int64)
-        self._span_s = np.inf, -np.inf
-        self._waiting: list[SpikeBlock] = []
-        self._n_waiting = 0
+        self.of_channels = np.zeros(channels, np.int64)
+        self.span_s = 0.0, 0.0
 
     def add(self, times_s: Float64[np.ndarray, " spikes"], channel: Int[np.ndarray, " spikes"]) -> None:
-        """Add spikes; refuses times that are not finite and unknown channels, in this call or a later one."""
-        if len(times_s):
-            self._waiting.append((times_s, channel))
-            self._n_waiting += len(times_s)
-            # Counting many takes as long as counting one.
-            if self._n_waiting > _COUNTED_AT_ONCE:
-                self._count()
-
-    @property
-    def of_channels(self) -> Int64[np.ndarray, " channels"]:
-        """Spikes counted so far, shape (channels,)."""
-        self._count()
-        return self._counts
-
-    @property
-    def span_s(self) -> tuple[float, float]:
-        """The earliest and the latest time; 0 if there are no spikes."""
-        self._count()
-        return self._span_s if np.isfinite(self._span_s[0]) else (0.0, 0.0)
-
-    def _count(self) -> None:
-        if not self._waiting:
+        """Add spikes; refuses times that are not finite and unknown channels."""
+        channels = len(self.of_channels)
+        if not len(times_s):
             return
-        times_s, channel = (np.concatenate(arrays) for arrays in zip(*self._waiting, strict=True))
-        self._waiting, self._n_waiting = [], 0
-        channels = len(self._counts)
         if not np.all(np.isfinite(times_s)):
             raise UnusableData("spike_times_s: expected finite times in seconds, got NaN or infinite ones")
         if channel.min() < 0 or channel.max() >= channels:
             wrong = channel[(channel < 0) | (channel >= channels)][0]
             raise UnusableData(f"spike_channels: expected rows of the {channels} channels, got {wrong}")
-        self._counts += np.bincount(channel, minlength=channels)
-        self._span_s = min(self._span_s[0], float(times_s.min())), max(self._span_s[1], float(times_s.max()))
+        every_s = np.append(times_s, self.span_s if self.of_channels.any() else ())
+        self.span_s = float(every_s.min()), float(every_s.max())
+        self.of_channels += np.bincount(channel, minlength=channels)
 
 
 def write_spikes(dataset: h5py.Dataset, blocks: Iterable[SpikeBlock], counts: Int64[np.ndarray, " channels"]) -> None:
