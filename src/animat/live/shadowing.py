@@ -15,6 +15,7 @@ from typing import Any
 
 from animat.cultures.base import Culture
 from animat.cultures.budget import Account, record_within
+from animat.cultures.failures import describe_error
 from animat.cultures.series import STATE_FILE, order_seed, room_bytes_of
 from animat.cultures.under_way import PartialRecording
 from animat.cultures.virtual import VirtualCulture
@@ -64,15 +65,9 @@ class LiveRun:
     gap: RealityGap
 
     def to_dict(self) -> dict[str, Any]:
-        return {
-            "recordings": [str(file) for file in self.recordings],
-            "policies": list(self.policies),
-            "swaps": list(self.swaps),
-            "iterations": self.iterations,
-            "culture_min": self.culture_min,
-            "wall_s": self.wall_s,
-            "closed_loop": self.gap.to_dict(),
-        }
+        plain = {name: getattr(self, name) for name in ("swaps", "iterations", "culture_min", "wall_s")}
+        files, gap = [str(file) for file in self.recordings], self.gap.to_dict()
+        return {**plain, "recordings": files, "policies": list(self.policies), "closed_loop": gap}
 
 
 def live(
@@ -225,7 +220,7 @@ class _Run:
             return
         self.has_ended_early = True
         is_person = isinstance(error, KeyboardInterrupt)
-        message = "stopped by a person" if is_person else " ".join(f"{type(error).__name__}: {error}".split())
+        message = "stopped by a person" if is_person else describe_error(error)
         with suppress(Exception):
             self.culture.stop(message)
         with suppress(InvalidFile):

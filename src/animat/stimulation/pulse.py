@@ -52,11 +52,6 @@ class Phase:
         """
         return self.amplitude * self.duration_us / 1000
 
-    def to_dict(self) -> dict[str, float]:
-        """As data for JSON."""
-        unit = "mv" if self.kind == "voltage" else "ua"
-        return {"duration_us": self.duration_us, f"amplitude_{unit}": self.amplitude}
-
 
 @record
 class Pulse:
@@ -89,7 +84,8 @@ class Pulse:
 
     def to_list(self) -> list[dict[str, float]]:
         """As data for JSON."""
-        return [phase.to_dict() for phase in self.phases]
+        unit = "mv" if self.kind == "voltage" else "ua"
+        return [{"duration_us": phase.duration_us, f"amplitude_{unit}": phase.amplitude} for phase in self.phases]
 
     @staticmethod
     def from_list(phases: Pulse | Sequence[Mapping[str, Any]]) -> Pulse:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from itertools import count
 from typing import Any, NamedTuple
@@ -90,29 +90,18 @@ def _routed(array: Any) -> dict[int, int]:
 
 def _connect(array: Any, electrodes: list[int]) -> dict[int, int]:
     """Connect each electrode to a separate unit; raises DeviceFailed if some have none or share one."""
-    electrode_of: dict[int, int] = {}
-    without, shared = [], []
+    on_unit: dict[int, list[int]] = defaultdict(list)
     for electrode in electrodes:
         array.connect_electrode_to_stimulation(electrode)
         reply = str(array.query_stimulation_at_electrode(electrode)).strip()
-        unit = int(reply) if reply.isdigit() else UNITS
-        if unit >= UNITS:
-            without.append(electrode)
-        elif unit in electrode_of:
-            shared.append(f"electrodes {electrode_of[unit]} and {electrode} share unit {unit}")
-        else:
-            electrode_of[unit] = electrode
-    if without:
-        raise DeviceFailed(
-            f"MaxOne: expected a stimulation unit for each stimulation electrode, but there is none for "
-            f"{_named(without)}: choose others nearby"
-        )
-    if shared:
-        raise DeviceFailed(
-            f"MaxOne: expected a separate stimulation unit for each stimulation electrode, but {'; '.join(shared)}: "
-            "choose another near one of each pair"
-        )
-    return {electrode: unit for unit, electrode in electrode_of.items()}
+        on_unit[int(reply) if reply.isdigit() else UNITS].append(electrode)
+    expected = "MaxOne: expected a separate stimulation unit for each stimulation electrode"
+    if without := [electrode for unit, connected in on_unit.items() if unit >= UNITS for electrode in connected]:
+        raise DeviceFailed(f"{expected}, but there is none for {_named(without)}: choose others nearby")
+    several = {unit: " and ".join(map(str, connected)) for unit, connected in on_unit.items() if len(connected) > 1}
+    if shared := "; ".join(f"electrodes {connected} share unit {unit}" for unit, connected in several.items()):
+        raise DeviceFailed(f"{expected}, but {shared}: choose another near one of them")
+    return {electrode: unit for unit, (electrode,) in on_unit.items()}
 
 
 def _named(electrodes: list[int]) -> str:
