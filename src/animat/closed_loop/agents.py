@@ -145,10 +145,8 @@ def agent_of(
 ) -> Agent:
     """A control of the simulator as an agent of a closed loop, in which policies take turns.
 
-    Random spikes are drawn from `responses_hz`, the non-burst responses of all conditions.
-
-    Raises:
-        InvalidArgument: for a control whose commands do not come from responses, which no loop can run.
+    Random spikes are drawn from `responses_hz`, the non-burst responses of all conditions. InvalidArgument is raised
+    for a control whose commands do not come from responses, which no loop can run.
     """
     if control.commands is not None:
         raise InvalidArgument(

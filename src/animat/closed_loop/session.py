@@ -153,10 +153,7 @@ class Session:
         """The session as a recording: everything that was observed, and every pulse as a stimulus of its presentation.
 
         The responses that are extracted from it are, bit for bit, those that the loop acted on. All spikes are read
-        into memory; for a long session read `recording_file` instead.
-
-        Raises:
-            InvalidFile: for an inconsistent log.
+        into memory; for a long session read `recording_file` instead. Raises InvalidFile for an inconsistent log.
         """
         with expect_session_log(self.folder / LOG_FILE):
             blocks = [(np.empty(0), np.empty(0, np.int64)), *self.log.spike_blocks()]
@@ -236,11 +233,7 @@ def describe_left_out(left_out: Mapping[str, int]) -> str:
 
 
 def read_session(path: str | os.PathLike[str]) -> Session:
-    """Read a session from its folder or its log, whatever ended it.
-
-    Raises:
-        InvalidFile: if the log is missing or not that of a session, or its header is invalid.
-    """
+    """Read a session from its folder or its log, whatever ended it; InvalidFile if that is missing or damaged."""
     path = Path(path)
     file = path / LOG_FILE if is_folder(path) else path
     if is_absent(file):

@@ -154,11 +154,7 @@ class Culture(Openable):
 
     @final
     def rest(self, duration_s: float) -> None:
-        """Let time pass unobserved.
-
-        Raises:
-            InvalidArgument, DeviceFailed: as `deliver` does.
-        """
+        """Let time pass unobserved; raises as `deliver` does."""
         turns, duration_s = self._opened(), _plain_duration(duration_s)
         with as_device_failure(self.name, "rest"), turns:
             self._rest(duration_s)

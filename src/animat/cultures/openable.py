@@ -178,10 +178,8 @@ class Openable(abc.ABC):
     def close(self) -> None:
         """Leave the device safe and release it; a closed culture stays closed.
 
-        A delivery in progress in another thread is stopped; opening in another thread is waited for.
-
-        Raises:
-            DeviceFailed: if the device does not confirm that it is safe; the culture is closed all the same.
+        A delivery in progress in another thread is stopped; opening in another thread is waited for. Raises
+        DeviceFailed if the device does not confirm that it is safe; the culture is closed all the same.
         """
         # A fork copies a lock that another thread holds, but not the thread that would release it.
         is_ours = self.__process == os.getpid()
@@ -244,8 +242,7 @@ class Openable(abc.ABC):
     def stop(self, reason: str = "requested") -> None:
         """Emergency stop: deliver nothing more until the culture is closed and opened again. Safe from any thread.
 
-        Raises:
-            DeviceFailed: if the device does not confirm that it stopped; all later stimuli are refused all the same.
+        Raises DeviceFailed if the device does not confirm that it stopped; later stimuli are refused all the same.
         """
         # Waits for no turn: the call that has it may hang. A culture being opened finds the reason and opens stopped.
         self.__stops.append(reason)

@@ -164,8 +164,7 @@ class Protocol:
 def read_protocol(path: str | os.PathLike[str], defaults: Protocol | None = None) -> Protocol:
     """Read a protocol from a JSON file, as `Protocol.to_json` writes it; keys left out take the `defaults`.
 
-    Raises:
-        InvalidFile: naming the file, the key, what was expected and what came.
+    Raises InvalidFile for anything else, naming the key.
     """
     with in_file(path):
         return Protocol.from_json(read_plain_text(path, _MOST_BYTES), defaults or PAPER)

@@ -16,11 +16,7 @@ Kind = Literal["voltage", "current"]
 
 @record
 class Phase:
-    """A phase of constant voltage or current: exactly one of the two amplitudes is given; negative is cathodic.
-
-    Raises:
-        InvalidArgument: for both amplitudes or neither, a number that is not finite, or no duration.
-    """
+    """A phase of constant voltage or current. Negative is cathodic; InvalidArgument unless one amplitude is given."""
 
     duration_us: Positive
     amplitude_mv: Number | None = None
@@ -55,11 +51,7 @@ class Phase:
 
 @record
 class Pulse:
-    """Phases that follow each other without a gap, all of the same kind.
-
-    Raises:
-        InvalidArgument: for no phases, phases of both kinds, or anything that is not a phase.
-    """
+    """Phases that follow each other without a gap; InvalidArgument for none, or for phases of both kinds."""
 
     phases: Annotated[tuple[Phase, ...], Field(min_length=1)]
 
