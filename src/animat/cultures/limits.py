@@ -83,7 +83,7 @@ class Limits:
                 )
 
     def check_pulse(self, pulse: Pulse) -> float:
-        """The net charge of a pulse as the device rounds it; UnsafeStimulus if it, or what is requested, exceeds a limit."""
+        """The net charge of a pulse as the device rounds it; UnsafeStimulus if it, or the request, exceeds a limit."""
         if pulse.kind != self.kind:
             expected = f"expected a {self.kind} pulse, which this kind of culture takes"
             raise UnsafeStimulus("kind", f"{expected}, got a {pulse.kind} pulse ({pulse})", argument="pulse")

@@ -166,7 +166,7 @@ class VirtualCulture(ComputedCulture):
 
     @checked_arguments
     def save_state(self, path: str | os.PathLike[str], **remarks: int) -> None:
-        """Write the complete state, to continue from bit for bit, and whole numbers as remarks; InvalidFile if that fails."""
+        """Write the state, to continue from bit for bit, and whole numbers as remarks; InvalidFile if that fails."""
         from animat.cultures.virtual_state import VirtualState, write_state
 
         held = self._held_ns, self._held_neuron

@@ -52,7 +52,7 @@ class Channels:
 
     @staticmethod
     def on(array: ElectrodeArray, electrode: Int64[np.ndarray, " channels"], label: Any = None) -> Channels:
-        """The channel table for electrodes, numbered unless labelled; InvalidArgument for one that is not on the array."""
+        """The channel table for electrodes, numbered unless labelled; InvalidArgument for one not on the array."""
         x_um, y_um = array.position_um(electrode)
         label = np.arange(len(electrode)) if label is None else np.asarray(label)
         return Channels(label=label.astype(np.str_), electrode=electrode, x_um=x_um, y_um=y_um)
