@@ -210,7 +210,7 @@ def test_a_state_goes_on_bit_for_bit(tmp_path: Path) -> None:
     with pytest.raises(Mismatch, match="which differs in scan_s"):
         small_culture(scan_s=2.0).restore_state(tmp_path / "culture.state")
     fewer = replace(again.selection, recording=again.selection.recording[:50])
-    with pytest.raises(Mismatch, match=r"which differs in selection: .* or use the same electrodes"):
+    with pytest.raises(Mismatch, match=r"which differs in selection: use the same electrodes"):
         small_culture(selection=fewer).restore_state(tmp_path / "culture.state")
     small_culture(selection=again.selection).restore_state(tmp_path / "culture.state")
     whole = (tmp_path / "culture.state").read_bytes()

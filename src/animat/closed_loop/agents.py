@@ -149,9 +149,7 @@ def agent_of(
     for a control whose commands do not come from responses, which no loop can run.
     """
     if control.commands is not None:
-        raise InvalidArgument(
-            f"control: expected one whose commands come from responses, got {control.name}, which only a simulator runs"
-        )
+        raise InvalidArgument(f"control: expected one whose commands come from responses, got {control.name}")
     actor = control.actor
     controller: Controller | Mapping[str, Controller]
     if isinstance(actor, Networks):

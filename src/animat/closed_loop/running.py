@@ -196,9 +196,8 @@ class _Supervisor:
                 return stopped
             by_s, who = driver.deadline
             if time.monotonic() > by_s and thread.is_alive():
-                return Ending(
-                    "hang", f"{who} did not answer {self._loop.patience_s:g} s after it should have: abandoned"
-                )
+                late = f"{self._loop.patience_s:g} s after it should have"
+                return Ending("hang", f"{who} did not answer {late}: abandoned")
             self._report()
         return self._ending or Ending("crash", "the loop's thread ended without giving a reason")
 
@@ -352,9 +351,7 @@ def check_session(culture: Culture, loop: Loop, agents: Sequence[Agent], episode
             "the name of a control"
         )
     if len(episodes) != len(agents):
-        raise InvalidArgument(
-            f"episodes: expected one number, or one for each of {len(agents)} agents, got {len(episodes)}"
-        )
+        raise InvalidArgument(f"episodes: expected one number, or {len(agents)}, one per agent, got {len(episodes)}")
     for number in episodes:
         check_episodes("episodes", number)
     expect_at_least("seed", seed, 0)
@@ -362,10 +359,7 @@ def check_session(culture: Culture, loop: Loop, agents: Sequence[Agent], episode
         raise InvalidArgument(f"patterns: expected at most the culture's {len(culture.patterns)}, got {loop.patterns}")
     seeing = [agent.name for agent, n in zip(agents, episodes, strict=True) if any(map(agent.sees_neurons, range(n)))]
     if seeing and loop.remembering is None:
-        raise InvalidArgument(
-            f"loop: expected `remembering` of a recording for agents that see the history state ({', '.join(seeing)}), "
-            "got none"
-        )
+        raise InvalidArgument(f"loop: expected `remembering`, as {', '.join(seeing)} sees the history state, got none")
     loop.readouts.members(culture.channels)
     culture.limits.check_pulse(loop.pulse)
     if unknown := sorted({*loop.encoder.electrodes} - {*culture.stimulation_electrodes}):

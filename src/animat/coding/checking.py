@@ -29,9 +29,8 @@ def check_mapping(mapping: Mapping) -> None:
     try:
         hash(mapping)
     except Exception as error:
-        raise InvalidArgument(
-            f"{type(mapping).__name__}: expected a frozen dataclass of plain parameters ({first_line(error)})"
-        ) from error
+        expected = f"{type(mapping).__name__}: expected a frozen dataclass of plain parameters"
+        raise InvalidArgument(f"{expected} ({first_line(error)})") from error
     _check_commands(mapping)
 
 
@@ -55,11 +54,9 @@ def _check_commands(mapping: Mapping) -> None:
             )
         for i in (0, -1):
             one = _results(mapping.command, _RESPONSES_HZ[i], percentiles, f"{expected} commands")
-            if one.shape != () or not one == u[i]:
-                raise InvalidArgument(
-                    f"{expected} the same command for a single response as in an array, {u[i]:g}, got "
-                    f"{shown(one.tolist())}"
-                )
+            if one.shape != () or one != u[i]:
+                same = f"the same command for a single response as in an array, {u[i]:g}"
+                raise InvalidArgument(f"{expected} {same}, got {shown(one.tolist())}")
         # Training computes commands under `jax.jit`, and a closed loop in numpy.
         hint = ": use functions of namespace_of(x), and where in place of if"
         same = _results(compiled, _RESPONSES_HZ, percentiles, f"{expected} it to run under jax.jit", hint)

@@ -197,10 +197,8 @@ class Culture(Openable):
         x_um, y_um = (np.append(positions, np.nan)[rows] for positions in (table.x_um, table.y_um))
         places = electrodes_of(protocol.places, np.array(sites, np.int64), x_um, y_um)
         if strange := sorted({*chain(*places)} - {*sites}):
-            raise InvalidArgument(
-                f"places: expected electrodes among the {len(sites)} that stimulate this culture "
-                f"({some_of(sorted(sites))}), got {some_of(strange)}"
-            )
+            them = f"the {len(sites)} that stimulate this culture ({some_of(sorted(sites))})"
+            raise InvalidArgument(f"places: expected electrodes among {them}, got {some_of(strange)}")
         return make_schedule(protocol, self.patterns, seed, places=places)
 
     @final

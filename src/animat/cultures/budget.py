@@ -61,10 +61,8 @@ class Account:
             return
         for electrode, more in _counted(stimuli).items():
             if self._on[electrode] + more > most:
-                raise BudgetSpent(
-                    f"budget.pulses_per_electrode: electrode {electrode} had {self._on[electrode]} of {most} pulses, "
-                    f"and {_more(more)} wanted"
-                )
+                had = f"electrode {electrode} had {self._on[electrode]} of {most} pulses"
+                raise BudgetSpent(f"budget.pulses_per_electrode: {had}, and {_more(more)} wanted")
 
     def check_number(self, wanted: int) -> None:
         """Raise `BudgetSpent` unless the budget covers this many more pulses, on any electrodes."""

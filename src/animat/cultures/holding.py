@@ -34,9 +34,7 @@ def hold(device: Path, holder: str) -> Iterator[bool]:
         try:
             # In a world-writable folder another user could point a link at one of ours.
             if device.is_symlink() or (device.exists() and not device.is_dir()):
-                raise DeviceFailed(
-                    f"{device.name}: expected a folder as its lock, got {device}, a file or a link: remove it"
-                )
+                raise DeviceFailed(f"{device.name}: expected a folder as its lock, got another file: remove {device}")
             stack.enter_context(exclusive_lock(device))
             if device.stat().st_uid == os.geteuid():
                 # Other users of the machine may hold it later; they cannot remove our files.

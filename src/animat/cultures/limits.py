@@ -77,10 +77,8 @@ class Limits:
         for field in fields(Limits):
             ours, theirs = getattr(self, field.name), getattr(device, field.name)
             if not _IS_AS_TIGHT[field.name](ours, theirs):
-                raise InvalidArgument(
-                    f"limits.{field.name}: expected no looser than the device's {theirs}, got {ours}: limits can be "
-                    "tightened, never loosened"
-                )
+                expected = f"limits.{field.name}: expected no looser than the device's {theirs}"
+                raise InvalidArgument(f"{expected}, got {ours}: limits can be tightened, never loosened")
 
     def check_pulse(self, pulse: Pulse) -> float:
         """The net charge of a pulse as the device rounds it; UnsafeStimulus if it, or the request, exceeds a limit."""

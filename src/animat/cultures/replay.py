@@ -56,10 +56,8 @@ class ReplayCulture(ComputedCulture):
         first = self._recordings[0]
         for recording in self._recordings:
             if recording.channels.label.tolist() != first.channels.label.tolist():
-                raise Mismatch(
-                    f"recordings: expected the same channels in all, but those at {in_min(recording.start_min)} differ "
-                    f"from those at {in_min(first.start_min)}"
-                )
+                minutes = f"{in_min(recording.start_min)} differ from those at {in_min(first.start_min)}"
+                raise Mismatch(f"recordings: expected the same channels in all, but those at {minutes}")
             stimuli = recording.stimuli
             for what, is_known in (
                 ("frequency", np.isfinite(stimuli.frequency_hz)),
@@ -154,10 +152,8 @@ class ReplayCulture(ComputedCulture):
         pool = np.flatnonzero(same)
         if not len(pool):
             known = ", ".join(f"{f:g}" for f in distinct(frequency_hz))
-            raise InvalidArgument(
-                f"frequency_hz: expected one that was recorded ({known} Hz), got {stimulus.frequency_hz:g}: a replay "
-                "cannot answer others"
-            )
+            expected = f"frequency_hz: expected one that was recorded ({known} Hz)"
+            raise InvalidArgument(f"{expected}, got {stimulus.frequency_hz:g}: a replay cannot answer others")
         return recording, pool
 
     def _answer(self, time_ns: int, recording: Recording, pulse: int) -> None:

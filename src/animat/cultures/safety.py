@@ -45,9 +45,7 @@ class Admitted:
         raise InvalidArgument(f"Admitted.{name}: expected to stay unchanged after admission; request other stimuli")
 
     def __reduce_ex__(self, protocol: object) -> NoReturn:
-        raise InvalidArgument(
-            "Admitted: expected to be delivered once, by the culture that admitted it; it cannot be copied"
-        )
+        raise InvalidArgument("Admitted: expected to be delivered once, by the culture that admitted it, got a copy")
 
 
 class Event(NamedTuple):
@@ -241,9 +239,7 @@ class Guard:
         if len(set(electrodes)) < len(electrodes):
             raise UnsafeStimulus("sites", f"expected each electrode once in a stimulus, got {electrodes}")
         if strange := [electrode for electrode in electrodes if electrode not in self._sites]:
-            raise UnsafeStimulus(
-                "sites", f"expected stimulation sites of this culture, got electrode {strange[0]}: choose among them"
-            )
+            raise UnsafeStimulus("sites", f"expected sites that stimulate this culture, got electrode {strange[0]}")
         return self._net_charge_of(stimulus.pulse)
 
     def _add_charge(self, left_on: dict[int, float], electrodes: Sequence[int], net_charge: float) -> None:

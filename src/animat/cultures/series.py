@@ -179,15 +179,12 @@ def check_interval(protocol: Protocol, sessions: int, interval_min: float, n_pat
     if not 0 < interval_min < float("inf"):
         raise InvalidArgument(f"interval_min: expected more than 0 minutes, got {interval_min:g}")
     if sessions > 1 and sessions * interval_min > LONGEST_MIN:
-        raise InvalidArgument(
-            f"sessions, interval_min: expected recordings within a year, got {shown(sessions)} every "
-            f"{interval_min:g} min"
-        )
+        given = f"{shown(sessions)} every {interval_min:g} min"
+        raise InvalidArgument(f"sessions, interval_min: expected recordings within a year, got {given}")
     takes_min = minutes_of(protocol, n_patterns)
     if sessions > 1 and interval_min < takes_min:
-        raise InvalidArgument(
-            f"interval_min: expected at least the {takes_min:.2f} min that a recording takes, got {interval_min:g}"
-        )
+        expected = f"at least the {takes_min:.2f} min that a recording takes"
+        raise InvalidArgument(f"interval_min: expected {expected}, got {interval_min:g}")
 
 
 def minutes_of(protocol: Protocol, n_patterns: int | None = None) -> float:

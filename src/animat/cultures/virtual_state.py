@@ -71,9 +71,7 @@ def read_state(path: Path, settings: Mapping[str, str], tissue: Tissue) -> Virtu
                 remedy = "use the same settings, or start another culture in another folder"
                 if name == "tissue_revision":
                     remedy = "continue with the version of animat that wrote it, or start again in another folder"
-                raise Mismatch(
-                    f"{path}: expected the state of this culture, got another's, which differs in {name}: {remedy}"
-                )
+                raise Mismatch(f"{path}: expected the state of this culture, got one which differs in {name}: {remedy}")
         snapshot = Snapshot(
             seed=tissue.seed,
             parameters=tissue.parameters,

@@ -84,9 +84,8 @@ def check_plan(
     if training.neural_observation:
         raise InvalidArgument("neural_observation: expected False, as a live run has none, got True")
     if training.pulse_cost:
-        raise InvalidArgument(
-            f"pulse_cost: expected 0, as all conditions of a live run cost the same, got {training.pulse_cost:g}"
-        )
+        expected = "expected 0, as all conditions of a live run cost the same"
+        raise InvalidArgument(f"pulse_cost: {expected}, got {training.pulse_cost:g}")
     if training.lessons or training.assess:
         raise InvalidArgument("lessons, assess: expected none, as the end of a live run is not known, got some")
     if (n := training.robot.n_commands) > 1:
@@ -97,10 +96,8 @@ def check_plan(
     expect_trainable(training, is_saved=True)
     takes_min = minutes_of(protocol)
     if takes_min > timetable.interval_min:
-        raise InvalidArgument(
-            f"interval_min: expected at least the {takes_min:.2f} min that a recording takes, "
-            f"got {timetable.interval_min:g}"
-        )
+        expected = f"at least the {takes_min:.2f} min that a recording takes"
+        raise InvalidArgument(f"interval_min: expected {expected}, got {timetable.interval_min:g}")
     with for_the_first_recording():
         places = max(1, protocol.n_places) - (NONE in protocol.places)
         (account or Account()).check_number(len(protocol.frequencies_hz) * places * protocol.trials * protocol.pulses)
@@ -111,7 +108,5 @@ def check_plan(
     Loop(training.robot, training.mapping, conditions, np.zeros(N_PERCENTILES, np.float32), **loop_settings)
     expect_no_file(folder, "the live run")
     if folder.exists() and any(file.name != LOCK for file in folder.iterdir()):
-        raise Mismatch(
-            f"{folder}: expected an empty folder for a live run, got one with files; choose another, or see what it "
-            f"holds: animat watch {folder}"
-        )
+        remedy = f"choose another, or see what it holds: animat watch {folder}"
+        raise Mismatch(f"{folder}: expected an empty folder for a live run, got one with files; {remedy}")

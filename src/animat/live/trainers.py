@@ -155,9 +155,7 @@ class Trainers:
                 future.result()
             except BrokenExecutor as error:
                 names = " and ".join(f"p{member}" for member in self._futures[future].members)
-                raise AnimatError(
-                    f"training {names}: {error} while the culture was recorded; the recordings are kept"
-                ) from error
+                raise AnimatError(f"training {names}: {error} meanwhile; the recordings are kept") from error
         swaps: list[dict[str, Any]] = []
         for group in self._groups:
             latest = reported(self._exchange.report_of(group))

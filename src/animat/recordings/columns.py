@@ -123,10 +123,8 @@ class PlainColumns:
             noted.append(Finding("silent-channels-unknown", "warning", message, float(len(fired))))
             return _channel_table(fired.astype(np.str_), None, None), rows.reshape(-1).astype(np.int64)
         if len(set(lengths.values())) > 1:
-            raise UnusableData(
-                "channel columns: expected one row per channel in each, got "
-                + ", ".join(f"{length} in {name}" for name, length in lengths.items())
-            )
+            got = ", ".join(f"{length} in {name}" for name, length in lengths.items())
+            raise UnusableData(f"channel columns: expected one row per channel in each, got {got}")
         n_channels = next(iter(lengths.values()))
         given = np.arange(n_channels) if self.channel_label is None else np.asarray(self.channel_label)
         labels = _names("channel_label", given)
@@ -286,10 +284,8 @@ def _rows_of(values: Column, labels: Column) -> Int64[np.ndarray, " spikes"]:
     unknown = distinct[rows == UNKNOWN]
     if len(unknown):
         n_spikes = np.count_nonzero(np.isin(values, unknown))
-        raise UnusableData(
-            f"spike_channel: expected labels listed in channel_label, got {n_spikes} spikes on "
-            f"{len(unknown)} unknown channels (such as {str(unknown[0])!r})"
-        )
+        got = f"{n_spikes} spikes on {len(unknown)} unknown channels (such as {str(unknown[0])!r})"
+        raise UnusableData(f"spike_channel: expected labels listed in channel_label, got {got}")
     return rows[which.reshape(-1)]
 
 

@@ -190,10 +190,8 @@ def read_traces(
         kind = "another file"
         if magic.startswith(ZIP) or path.name.endswith(TEXT_NAMES):
             kind = f"{'NPZ' if magic.startswith(ZIP) else 'CSV'}, which holds spikes (leave out --raw to convert these)"
-        raise InvalidFile(
-            f"{path}: expected HDF5 with raw traces (MaxWell, CL1, NWB), got {kind}; for traces in another format name "
-            "it with --reader, such as intan"
-        )
+        remedy = "for traces in another format name it with --reader, such as intan"
+        raise InvalidFile(f"{path}: expected HDF5 with raw traces (MaxWell, CL1, NWB), got {kind}; {remedy}")
     traces, base = open_traces(path, part=part, stimuli=stimuli)
     return _with_detected_spikes(traces, base, settings, progress)
 

@@ -128,23 +128,17 @@ class Recording:
         # Events up to a century before and after 0 are up to two centuries apart.
         if not (abs(self.start_s) <= CENTURY_S and 0 <= self.duration_s <= 2 * CENTURY_S):
             length = ", the latter 0 or more" if self.duration_s < 0 else ""
-            raise UnusableData(
-                f"start_s, duration_s: expected finite seconds within a century{length}, got {self.start_s:g} and "
-                f"{self.duration_s:g}"
-            )
+            expected = f"start_s, duration_s: expected finite seconds within a century{length}"
+            raise UnusableData(f"{expected}, got {self.start_s:g} and {self.duration_s:g}")
         if not abs(self.start_min) <= CENTURY_S / 60:
             raise UnusableData(f"start_min: expected finite minutes within a century, got {self.start_min:g}")
         if self.sampling_rate_hz <= 0 or self.sampling_rate_hz > FASTEST_HZ:
-            raise UnusableData(
-                f"sampling_rate_hz: expected a positive rate up to {FASTEST_HZ:g} Hz, or NaN if not known, "
-                f"got {self.sampling_rate_hz:g}"
-            )
+            expected = f"a positive rate up to {FASTEST_HZ:g} Hz, or NaN if not known"
+            raise UnusableData(f"sampling_rate_hz: expected {expected}, got {self.sampling_rate_hz:g}")
         for name, times in (("spike_times_s", self.spike_times_s), ("stimuli.time_s", self.stimuli.time_s)):
             if len(times) and (times[0] < self.start_s or times[-1] > self.stop_s):
-                raise UnusableData(
-                    f"{name}: expected times within the recording ({self.start_s:g} to {self.stop_s:g} s), "
-                    f"got {times[0]:g} to {times[-1]:g} s"
-                )
+                expected = f"times within the recording ({self.start_s:g} to {self.stop_s:g} s)"
+                raise UnusableData(f"{name}: expected {expected}, got {times[0]:g} to {times[-1]:g} s")
 
     @property
     def stop_s(self) -> float:

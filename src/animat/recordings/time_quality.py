@@ -156,10 +156,8 @@ def _impossible_firing(recording: Recording) -> str | None:
         return None
     median_hz = float(np.median(count[count > 0])) / recording.duration_s
     if median_hz > MANY_HZ:
-        return (
-            f"spike times cannot be in seconds: the median channel fires at {median_hz:,.0f} Hz, which no neuron does; "
-            "are they in minutes or hours?"
-        )
+        what = f"the median channel fires at {median_hz:,.0f} Hz, which no neuron does"
+        return f"spike times cannot be in seconds: {what}; are they in minutes or hours?"
     if recording.duration_s < LONG_S:
         return None
     hours = f"the recording would last {recording.duration_s / 3600:,.0f} h"

@@ -44,9 +44,8 @@ class ElectrodeArray:
         electrode = np.atleast_1d(np.asarray(electrode, dtype=np.int64))
         outside = (electrode < 0) | (electrode >= len(self))
         if np.any(outside):
-            raise InvalidArgument(
-                f"electrode: expected numbers from 0 to {len(self) - 1} on the {self.name}, got {electrode[outside][0]}"
-            )
+            expected = f"numbers from 0 to {len(self) - 1} on the {self.name}"
+            raise InvalidArgument(f"electrode: expected {expected}, got {electrode[outside][0]}")
         return (electrode % self.columns) * self.pitch_um, (electrode // self.columns) * self.pitch_um
 
     def distance_um(

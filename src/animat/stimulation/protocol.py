@@ -111,16 +111,12 @@ class Protocol:
         of_each = self.trials * self.pulses * max(1, self.n_places)
         pulses = len(self.frequencies_hz) * of_each
         if pulses > _MOST_PULSES:
-            raise InvalidArgument(
-                f"pulses: expected at most {_MOST_PULSES:,} in a recording (frequencies x places x trials x "
-                f"pulses), got {pulses:,}"
-            )
+            what = f"at most {_MOST_PULSES:,} in a recording (frequencies x places x trials x pulses)"
+            raise InvalidArgument(f"pulses: expected {what}, got {pulses:,}")
         stimulated_s = sum(of_each / f for f in self.frequencies_hz)
         if stimulated_s > _LONGEST_RECORDING_S:
-            raise InvalidArgument(
-                f"frequencies_hz: expected stimuli of at most a week ({_LONGEST_RECORDING_S:,} s) in a recording, got "
-                f"{stimulated_s:.3g} s"
-            )
+            expected = f"stimuli of at most a week ({_LONGEST_RECORDING_S:,} s) in a recording"
+            raise InvalidArgument(f"frequencies_hz: expected {expected}, got {stimulated_s:.3g} s")
 
     @property
     def presentation(self) -> Presentation:

@@ -24,10 +24,7 @@ class Phase:
 
     def __post_init__(self) -> None:
         if (self.amplitude_mv is None) == (self.amplitude_ua is None):
-            raise InvalidArgument(
-                f"amplitude: expected either amplitude_mv or amplitude_ua, got {self.amplitude_mv} and "
-                f"{self.amplitude_ua}"
-            )
+            raise InvalidArgument("amplitude: expected either amplitude_mv or amplitude_ua, got both or neither")
 
     @property
     def kind(self) -> Kind:

@@ -125,9 +125,7 @@ class Selection:
         """From the output of `to_dict`; raises InvalidArgument for anything else."""
         saved = read_record(_Saved, data, "selection")
         if len(set(map(len, saved.patterns))) > 1:
-            raise InvalidArgument(
-                "selection.patterns: expected the same number of electrodes in each, got different ones"
-            )
+            raise InvalidArgument("selection.patterns: expected the same number of electrodes in each, got others")
         fields: dict[str, Any] = {name: value for name, value in vars(saved).items() if name != "format"}
         return Selection(**fields | {"patterns": saved.patterns or np.empty((0, 0))})
 
@@ -177,10 +175,8 @@ def select_electrodes(
     # Ties are broken by electrode number, so that a scan always gives the same selection.
     recording = passed[np.lexsort((scan.electrode[passed], -scan.rate_hz[passed]))][: rule.recording_sites]
     if len(recording) < rule.stimulation_sites:
-        raise InvalidArgument(
-            f"stimulation_sites: expected at most as many as recording sites ({len(recording)}), "
-            f"got {rule.stimulation_sites}"
-        )
+        n, most = rule.stimulation_sites, len(recording)
+        raise InvalidArgument(f"stimulation_sites: expected at most as many as recording sites ({most}), got {n}")
     worth = (scan.amplitude_uv * scan.excitatory_score)[recording]
     stimulation = recording[np.lexsort((scan.electrode[recording], -worth))][: rule.stimulation_sites]
     chosen = np.sort(scan.electrode[stimulation])

@@ -116,17 +116,14 @@ class Stimuli:
         kinds = {"time_s": np.float64, "frequency_hz": np.float64, "pattern": np.int64, "presentation": np.int64}
         freeze(self, "the stimulus table", **kinds, electrodes=np.int64)
         if self.electrodes.ndim != 2:
-            raise UnusableData(
-                f"stimuli.electrodes: expected shape (stimuli, electrodes), padded with -1, got {self.electrodes.shape}"
-            )
+            expected = "stimuli.electrodes: expected shape (stimuli, electrodes), padded with -1"
+            raise UnusableData(f"{expected}, got {self.electrodes.shape}")
         expect_rising_times("stimuli.time_s", self.time_s)
         known = self.frequency_hz[~np.isnan(self.frequency_hz)]
         wrong = (known <= 0) | (known > FASTEST_HZ)
         if np.any(wrong):
-            raise UnusableData(
-                f"stimuli.frequency_hz: expected positive frequencies up to {FASTEST_HZ:g} Hz, or NaN, got "
-                f"{known[wrong][0]:g}"
-            )
+            expected = f"expected positive frequencies up to {FASTEST_HZ:g} Hz, or NaN"
+            raise UnusableData(f"stimuli.frequency_hz: {expected}, got {known[wrong][0]:g}")
         if np.any(np.diff(self.presentation) < 0):
             raise UnusableData("stimuli.presentation: expected numbers that never fall over time")
 

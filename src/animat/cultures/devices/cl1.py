@@ -200,16 +200,12 @@ class CL1Culture(Culture):
                 if (now_open := self._session) is not None:
                     now_open.interrupt()
             except Exception as failed:
-                outcome = (
-                    f"and it could not be interrupted ({describe_error(failed)}): make sure it gives no more pulses"
-                )
+                outcome = f"and it could not be interrupted ({describe_error(failed)}): make sure no more pulses come"
                 error.add_note(outcome)
             if isinstance(error, AnimatError) or not isinstance(error, Exception):
                 raise
-            raise DeviceFailed(
-                f"CL1: expected a loop over {duration_s:g} s, got {describe_error(error)}: "
-                f"{outcome}{_remedy(error, session)}"
-            ) from error
+            got = f"{describe_error(error)}: {outcome}{_remedy(error, session)}"
+            raise DeviceFailed(f"CL1: expected a loop over {duration_s:g} s, got {got}") from error
         self.spikes_not_on_electrodes += not_on_electrodes
         self.spikes_reported_late += late
         return observed
@@ -224,9 +220,8 @@ class CL1Culture(Culture):
             try:
                 session.neurons.read(piece, now)
             except TimeoutError as error:
-                raise DeviceFailed(
-                    f"CL1: expected to rest {duration_s:g} s, got {describe_error(error)}{_remedy(error, session)}"
-                ) from error
+                expected = f"CL1: expected to rest {duration_s:g} s"
+                raise DeviceFailed(f"{expected}, got {describe_error(error)}{_remedy(error, session)}") from error
             now += piece
 
     def _halt(self) -> None:
@@ -263,10 +258,8 @@ def _check_patterns(patterns: Patterns) -> Int64[np.ndarray, "patterns size"]:
             raise InvalidArgument(f"patterns: expected distinct channels in each, got {row} as number {number}")
         if strange := [channel for channel in row if channel not in SITES]:
             what = NO_STIMULATION.get(strange[0], "not one of the 64")
-            raise InvalidArgument(
-                f"patterns: expected channels that can stimulate, got channel {strange[0]} in number {number}, which "
-                f"is {what}: choose another"
-            )
+            expected = "patterns: expected channels that can stimulate"
+            raise InvalidArgument(f"{expected}, got channel {strange[0]} in number {number}, which is {what}")
     if not rows:
         raise InvalidArgument("patterns: expected at least one, got none")
     table = padded(rows)

@@ -113,10 +113,8 @@ class Session:
 
     def _check_going(self, queued: int, total: int) -> None:
         if total and self._halted.is_set():
-            raise DeviceFailed(
-                f"CL1: stopped while delivering: {queued} of {total} stimuli had been sent to the device, and what had "
-                "not begun was interrupted"
-            )
+            sent = f"{queued} of {total} stimuli had been sent to the device"
+            raise DeviceFailed(f"CL1: stopped while delivering: {sent}, and what had not begun was interrupted")
 
     def _queue(self, stimulus: Stimulus, frame: int) -> int:
         """Queue one stimulus on the device, at a frame or as soon as possible after it; returns the frame."""
@@ -147,9 +145,8 @@ def _began(stimulus: Stimulus, frame: int, reported: dict[int, deque[int]], star
         while reported[electrode] and reported[electrode][0] < frame:
             reported[electrode].popleft()
         if not reported[electrode]:
-            raise DeviceFailed(
-                f"CL1: expected a pulse on channel {electrode} {(frame - start) / FRAMES_PER_S:g} s into the "
-                "delivery, got none: the device left it out"
-            )
+            at_s = (frame - start) / FRAMES_PER_S
+            expected = f"a pulse on channel {electrode} {at_s:g} s into the delivery"
+            raise DeviceFailed(f"CL1: expected {expected}, got none: the device left it out")
         began.append(reported[electrode].popleft())
     return min(began)

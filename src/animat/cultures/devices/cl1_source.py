@@ -112,7 +112,7 @@ class SimulatedCL1:
         """Frames from `from_frame` on, not read before, and their spikes in order: frame, channel, waveform."""
         if from_frame < self._next:
             raise InvalidArgument(
-                f"from_frame: expected {self._next} or later, as time only moves forward, got {from_frame}"
+                f"from_frame: expected {self._next} or later: time only moves forward, got {from_frame}"
             )
         to_frame = from_frame + frame_count
         self._advance(to_frame)

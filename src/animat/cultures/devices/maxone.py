@@ -217,10 +217,8 @@ class MaxOneCulture(Culture):
             earliest = round(guard.earliest(relative, earliest / FRAMES_PER_S) * FRAMES_PER_S)
             stream.wait(earliest - INITIAL_DELAY)
             if halted.is_set():
-                raise DeviceFailed(
-                    f"MaxOne: stopped while delivering: {len(begun)} of {len(admitted.stimuli)} stimuli had been sent, "
-                    "and the units have no power"
-                )
+                sent = f"{len(begun)} of {len(admitted.stimuli)} stimuli had been sent"
+                raise DeviceFailed(f"MaxOne: stopped while delivering: {sent}, and the units have no power")
             sequence.send()
             # The pulse follows the initial delay after the server accepted the command: about now.
             first = stream.frame() + INITIAL_DELAY

@@ -43,13 +43,10 @@ class Pulse:
         for name in ("x_um", "y_um"):
             object.__setattr__(self, name, np.atleast_1d(np.asarray(getattr(self, name), dtype=np.float64)))
         if self.x_um.shape != self.y_um.shape or self.x_um.ndim != 1:
-            raise InvalidArgument(
-                f"x_um, y_um: expected one position per electrode, got shapes {self.x_um.shape} and {self.y_um.shape}"
-            )
+            shapes = f"{self.x_um.shape} and {self.y_um.shape}"
+            raise InvalidArgument(f"x_um, y_um: expected one position per electrode, got shapes {shapes}")
         if not 0 <= self.strength <= LARGEST_STRENGTH:
-            raise InvalidArgument(
-                f"strength: expected 0 to {LARGEST_STRENGTH:g}, 1 the full pulse, got {self.strength}"
-            )
+            raise InvalidArgument(f"strength: expected 0 to {LARGEST_STRENGTH:g}, 1 being full, got {self.strength}")
 
 
 class Reach(NamedTuple):

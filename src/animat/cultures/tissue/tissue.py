@@ -131,10 +131,7 @@ class Tissue:
     def restore(self, snapshot: Snapshot) -> None:
         """Return to a snapshot, from which the tissue continues bit for bit; refuses a state that it cannot reach."""
         if (snapshot.seed, snapshot.parameters) != (self.seed, self.parameters):
-            raise Mismatch(
-                f"snapshot: expected one of this tissue (seed {self.seed}), got one of seed {snapshot.seed} or with "
-                "other parameters: create a tissue with those"
-            )
+            raise Mismatch(f"snapshot: expected one of this tissue, with seed {self.seed}, got one of another")
         expect_sound(snapshot, self._state, self._wiring, self.step_ns)
         self._adopt(State(*(values.copy() for values in snapshot.state)))
         self._now_ns, self._step, self._kicks = snapshot.now_ns, snapshot.step, snapshot.kicks
@@ -146,10 +143,8 @@ class Tissue:
     def _kicks_of(self, pulse: Pulse, end_ns: int) -> Kicks:
         pulse_ns = round(pulse.time_s * NS) if isfinite(pulse.time_s) else -1
         if not self._now_ns <= pulse_ns < end_ns:
-            raise InvalidArgument(
-                f"pulses: expected times from {self.now_s:g} s to before {end_ns / NS:g} s on the tissue's clock, "
-                f"got {pulse.time_s:g} s"
-            )
+            expected = f"times from {self.now_s:g} s to before {end_ns / NS:g} s on the tissue's clock"
+            raise InvalidArgument(f"pulses: expected {expected}, got {pulse.time_s:g} s")
         return self._coupling.kicks(pulse, -(-pulse_ns // self.step_ns))
 
 

@@ -115,10 +115,8 @@ class Hdf5File:
         filtered = dataset.id.get_create_plist().get_nfilters() > 0
         possible = SPARE_VALUES + (self._bytes if filtered else self._bytes // max(dtype.itemsize, 1))
         if n_values > min(possible, LARGEST_VALUES) or n_values * dtype.itemsize > 8 * LARGEST_VALUES:
-            raise InvalidFile(
-                f"{self.path}: {name} claims {n_values:,} values, more than a file of {self._bytes:,} bytes can hold: "
-                "it is damaged, or not a recording"
-            )
+            claim = f"{n_values:,} values, more than a file of {self._bytes:,} bytes can hold"
+            raise InvalidFile(f"{self.path}: {name} claims {claim}: it is damaged, or not a recording")
         if missing := unavailable_filters(dataset):
             raise InvalidFile(f"{self.path}: {name} is compressed by {missing}: {PLUGIN_ADVICE}")
         values = np.asarray(dataset[()] if field is None else dataset.fields(field)[()])

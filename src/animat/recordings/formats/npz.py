@@ -125,10 +125,9 @@ def _electrodes_at(xy_um: Column, electrode: Column, electrode_xy_um: Column) ->
     """The electrode routed at each position, `UNKNOWN` if there is none."""
     n = len(electrode) if electrode.ndim == 1 else -1
     if electrode_xy_um.shape != (n, 2):
-        raise UnusableData(
-            "mapping_electrode, mapping_xy_um: expected shapes (electrodes,) and (electrodes, 2), "
-            f"got {electrode.shape} and {electrode_xy_um.shape}"
-        )
+        shapes = f"{electrode.shape} and {electrode_xy_um.shape}"
+        expected = "expected shapes (electrodes,) and (electrodes, 2)"
+        raise UnusableData(f"mapping_electrode, mapping_xy_um: {expected}, got {shapes}")
     if xy_um.ndim != 2:
         raise UnusableData(f"channel_xy_um: expected shape (channels, 2) in micrometres, got {xy_um.shape}")
     at = {tuple(xy): e for xy, e in zip(electrode_xy_um.tolist(), electrode.tolist(), strict=True)}

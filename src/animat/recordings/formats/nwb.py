@@ -65,10 +65,8 @@ def write_nwb(
         counts.add(*own)
     of_channels, (first_s, last_s) = counts.of_channels, counts.span_s
     if np.any(of_channels) and not recording.start_s <= first_s <= last_s <= recording.stop_s:
-        raise UnusableData(
-            f"spike_times_s: expected times within the recording ({recording.start_s:g} to {recording.stop_s:g} s), "
-            f"got {first_s:g} to {last_s:g} s"
-        )
+        expected = f"times within the recording ({recording.start_s:g} to {recording.stop_s:g} s)"
+        raise UnusableData(f"spike_times_s: expected {expected}, got {first_s:g} to {last_s:g} s")
     tree = nwb_file(recording, of_channels)
     with atomic_write(path) as temporary, _Disk(temporary, "r+") as disk:
         try:

@@ -63,10 +63,8 @@ def _place(file: Hdf5File, asked: str | None, findings: list[Finding]) -> str | 
     # Regular samples and epochs are hardly ever stimuli.
     perhaps = [at for at in elsewhere if not (file.has(f"{at}/starting_time") or at.endswith("/epochs"))]
     if not candidates and perhaps:
-        message = (
-            f"nothing in the file is named like stimuli; if one of {some_of(perhaps)} holds them, choose it with "
-            "--stimuli NAME (animat inspect, animat convert)"
-        )
+        remedy = "choose it with --stimuli NAME (animat inspect, animat convert)"
+        message = f"nothing in the file is named like stimuli; if one of {some_of(perhaps)} holds them, {remedy}"
         findings.append(Finding("stimuli-elsewhere", "note", message))
     return choose(f"{file.path}: stimuli", "--stimuli", candidates, None) if candidates else None
 

@@ -73,9 +73,8 @@ def _reader(name: str) -> Callable[..., Any]:
     try:
         extractors = importlib.import_module("spikeinterface.extractors")
     except ImportError as error:
-        raise InvalidArgument(
-            f"reader: expected the package SpikeInterface, which is not installed: {install_command('raw')}"
-        ) from error
+        missing = "reader: expected the package SpikeInterface, which is not installed"
+        raise InvalidArgument(f"{missing}: {install_command('raw')}") from error
     # Excludes readers of sortings, events and SpikeInterface's own objects, and one that needs more than a file.
     of_traces = list(extractors.recording_extractor_full_dict.values())
     readers = {n[5:]: getattr(extractors, n) for n in dir(extractors) if n.startswith("read_")}
