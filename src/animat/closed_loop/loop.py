@@ -128,10 +128,8 @@ class Loop:
             raise InvalidArgument(f"adaptive_from: expected calibration.adjusted, got {type(recorded).__name__}")
         n, shape = [len(each) for each in recorded.ranks], (len(self.conditions), len(self.readouts))
         if (len(n), recorded.slopes.shape[1]) != shape or not all(n):
-            raise InvalidArgument(
-                f"adaptive_from: expected responses to each of {shape[0]} conditions, in the loop's number of readouts "
-                f"({shape[1]}), got {n} in {recorded.slopes.shape[1]}"
-            )
+            expected = f"responses to each of {shape[0]} conditions, in the loop's number of readouts ({shape[1]})"
+            raise InvalidArgument(f"adaptive_from: expected {expected}, got {n} in {recorded.slopes.shape[1]}")
         if self.remembering not in (None, recorded.remembering):
             raise InvalidArgument("remembering: expected adaptive_from.remembering, got a different one")
 

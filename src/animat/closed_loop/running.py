@@ -346,10 +346,8 @@ def check_session(culture: Culture, loop: Loop, agents: Sequence[Agent], episode
     if not agents:
         raise InvalidArgument("agents: expected at least one, got none")
     if twice := [name for name, n in Counter(agent.name for agent in agents).items() if n > 1]:
-        raise InvalidArgument(
-            f"agents: expected each name once, got {some_of(twice)} more than once: rename the policy's file if it has "
-            "the name of a control"
-        )
+        remedy = "rename the policy's file if it has the name of a control"
+        raise InvalidArgument(f"agents: expected each name once, got {some_of(twice)} more than once: {remedy}")
     if len(episodes) != len(agents):
         raise InvalidArgument(f"episodes: expected one number, or {len(agents)}, one per agent, got {len(episodes)}")
     for number in episodes:
@@ -363,8 +361,7 @@ def check_session(culture: Culture, loop: Loop, agents: Sequence[Agent], episode
     loop.readouts.members(culture.channels)
     culture.limits.check_pulse(loop.pulse)
     if unknown := sorted({*loop.encoder.electrodes} - {*culture.stimulation_electrodes}):
-        raise Mismatch(
-            f"conditions: expected electrodes that the {culture.name} culture can stimulate "
-            f"({some_of(culture.stimulation_electrodes)}), got {some_of(unknown)}: run on the culture that was "
-            "recorded, or train on recordings of this one"
-        )
+        sites = some_of(culture.stimulation_electrodes)
+        expected = f"electrodes that the {culture.name} culture can stimulate ({sites})"
+        remedy = "run on the culture that was recorded, or train on recordings of this one"
+        raise Mismatch(f"conditions: expected {expected}, got {some_of(unknown)}: {remedy}")

@@ -60,7 +60,6 @@ def expect_fit(robot: str, n_commands: int, readouts: int) -> None:
 def expect_one_command(robot: str, n_commands: int) -> None:
     """Raise InvalidArgument for single commands to pick from with a robot that takes several at once."""
     if type(n_commands) is int and n_commands > 1:
-        raise InvalidArgument(
-            f"commands: expected none to pick from for {robot}, which takes {n_commands} at once: without neurons its "
-            "commands are continuous (baseline_commands = None)"
-        )
+        why = "without neurons they are continuous (baseline_commands = None)"
+        expected = f"expected none to pick from for {robot}"
+        raise InvalidArgument(f"commands: {expected}, which takes {n_commands} at once: {why}")

@@ -47,10 +47,9 @@ class Encoder:
                     "'interval:5,10 x electrode'"
                 )
             if not all(SLOWEST_HZ <= each <= FASTEST_HZ for each in condition.frequencies_hz):
-                raise UnusableData(
-                    f"condition {condition.label}: expected a frequency from {SLOWEST_HZ:g} to {FASTEST_HZ:g} Hz for a "
-                    f"closed loop, got {', '.join(f'{f:g}' for f in condition.frequencies_hz)}"
-                )
+                given = ", ".join(f"{f:g}" for f in condition.frequencies_hz)
+                expected = f"a frequency from {SLOWEST_HZ:g} to {FASTEST_HZ:g} Hz for a closed loop"
+                raise UnusableData(f"condition {condition.label}: expected {expected}, got {given}")
             if condition.electrodes == ():
                 raise UnusableData(
                     f"condition {condition.label}: expected recordings that state the electrodes of its pulses, which "
@@ -58,10 +57,9 @@ class Encoder:
                 )
         slowest_hz = min(min(condition.frequencies_hz) for condition in self.conditions)
         if self.pulses > slowest_hz / SLOWEST_HZ:
-            raise InvalidArgument(
-                f"pulses: expected trials of {1 / SLOWEST_HZ:g} s at most, got {shown(self.pulses)} pulses per trial, "
-                f"which take {self.pulses / slowest_hz:,.0f} s at {slowest_hz:g} Hz: use fewer"
-            )
+            take = f"which take {self.pulses / slowest_hz:,.0f} s at {slowest_hz:g} Hz: use fewer"
+            expected = f"expected trials of {1 / SLOWEST_HZ:g} s at most"
+            raise InvalidArgument(f"pulses: {expected}, got {shown(self.pulses)} pulses per trial, {take}")
 
     @property
     def electrodes(self) -> tuple[int, ...]:

@@ -40,15 +40,11 @@ def hold(device: Path, holder: str) -> Iterator[bool]:
                 # Other users of the machine may hold it later; they cannot remove our files.
                 device.chmod(0o1777)
         except (InvalidFile, OSError) as error:
-            raise DeviceFailed(
-                f"{device.name}: expected a folder as its lock that every user can write to, got {device}: "
-                f"{error.__cause__ or error}: remove it, or have its owner do so"
-            ) from error
+            got = f"{device}: {error.__cause__ or error}: remove it, or have its owner do so"
+            raise DeviceFailed(f"{device.name}: expected a folder that every user can write to, got {got}") from error
         except Mismatch as error:
-            raise DeviceFailed(
-                f"{device.name}: expected a device that is not in use, got one that another culture object holds, in "
-                "this program or another: close it there first"
-            ) from error
+            held = "one that another culture object holds, in this program or another: close it there first"
+            raise DeviceFailed(f"{device.name}: expected a device that is not in use, got {held}") from error
         yield _last(device, holder) != holder
 
 

@@ -64,11 +64,10 @@ class ReplayCulture(ComputedCulture):
                 ("electrodes", stimuli.electrodes != UNKNOWN),
             ):
                 if not np.any(is_known):
-                    raise UnusableData(
-                        f"the recording at {in_min(recording.start_min)}: expected stimuli of known frequency and "
-                        f"electrodes, got none of known {what}: a replay answers by frequency, and is stimulated on "
-                        f"electrodes; add the {what} to the table of stimuli"
-                    )
+                    expected = f"stimuli of known frequency and electrodes, got none of known {what}"
+                    why = "a replay answers by frequency, and is stimulated on electrodes"
+                    where = f"the recording at {in_min(recording.start_min)}"
+                    raise UnusableData(f"{where}: expected {expected}: {why}; add the {what} to the table of stimuli")
         self._seed = seed
         self._patterns = _patterns(first)
         self._zero_s = 60.0 * first.start_min

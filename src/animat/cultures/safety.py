@@ -194,11 +194,9 @@ class Guard:
             raise InvalidArgument(f"now_s: expected a finite time on the culture's clock, got {now_s}")
         self.expect_not_stopped()
         if self.delivered + len(stimuli) > limits.stimuli_per_session:
-            raise UnsafeStimulus(
-                "stimuli_per_session",
-                f"expected at most {limits.stimuli_per_session} stimuli in a session, got {len(stimuli)} more after "
-                f"{self.delivered}: request fewer, or begin a new session after a rest",
-            )
+            got = f"{len(stimuli)} more after {self.delivered}: request fewer, or begin a new session after a rest"
+            expected = f"expected at most {limits.stimuli_per_session} stimuli in a session"
+            raise UnsafeStimulus("stimuli_per_session", f"{expected}, got {got}")
         events: list[Event] = []
         left_on: dict[int, float] = {}
         # Stimuli requested so far go into a separate history: a request that fails must leave no trace.
@@ -210,18 +208,13 @@ class Guard:
                 raise UnsafeStimulus("overlap", f"expected finite times from 0 s on, got {stimulus.time_s}")
             start_ns = round((now_s + stimulus.time_s) * NS)
             if start_ns < busy_until_ns:
-                raise UnsafeStimulus(
-                    "overlap",
-                    f"expected each stimulus to begin after the previous one ends, got one {stimulus.time_s:g} s "
-                    f"from now, {(busy_until_ns - start_ns) / 1000:g} us too early: put them in order of time, "
-                    "further apart",
-                )
+                early = f"{stimulus.time_s:g} s from now, {(busy_until_ns - start_ns) / 1000:g} us too early"
+                expected = "expected each stimulus to begin after the previous one ends"
+                raise UnsafeStimulus("overlap", f"{expected}, got one {early}: put them in order, further apart")
             if start_ns < busy_until_ns + round(limits.gap_us * 1000):
-                raise UnsafeStimulus(
-                    "gap_us",
-                    f"expected {limits.gap_us:g} us or more from the end of a stimulus to the start of the next, got "
-                    f"{(start_ns - busy_until_ns) / 1000:g}: put them further apart",
-                )
+                got = f"{(start_ns - busy_until_ns) / 1000:g}: put them further apart"
+                expected = f"{limits.gap_us:g} us or more from the end of a stimulus to the start of the next"
+                raise UnsafeStimulus("gap_us", f"expected {expected}, got {got}")
             event = Event(start_ns, start_ns + round(stimulus.pulse.duration_us * 1000), stimulus.electrodes)
             self._check_pace(event, requested)
             requested.add([event], start_ns)
@@ -233,9 +226,8 @@ class Guard:
         """Check the limits on a single stimulus; returns the net charge that its pulse leaves on an electrode."""
         limits, electrodes = self.limits, stimulus.electrodes
         if not 1 <= len(electrodes) <= limits.electrodes_at_once:
-            raise UnsafeStimulus(
-                "electrodes_at_once", f"expected 1 to {limits.electrodes_at_once} electrodes, got {len(electrodes)}"
-            )
+            most = limits.electrodes_at_once
+            raise UnsafeStimulus("electrodes_at_once", f"expected 1 to {most} electrodes, got {len(electrodes)}")
         if len(set(electrodes)) < len(electrodes):
             raise UnsafeStimulus("sites", f"expected each electrode once in a stimulus, got {electrodes}")
         if strange := [electrode for electrode in electrodes if electrode not in self._sites]:
@@ -249,35 +241,26 @@ class Guard:
             left = left_on.get(electrode, self._left_on.get(electrode, 0.0)) + net_charge
             left_on[electrode] = left
             if not abs(left) <= most:
-                raise UnsafeStimulus(
-                    "net_charge_per_session",
-                    f"expected pulses of a session that leave -{most:g} to {most:g} {self.limits.units[1]} on an "
-                    f"electrode, got {left:g} on electrode {electrode}: use a balanced pulse, or begin a new session "
-                    "after a rest",
-                )
+                expected = f"pulses that leave -{most:g} to {most:g} {self.limits.units[1]} on an electrode"
+                got = f"{left:g} on electrode {electrode}: use a balanced pulse, or a new session after a rest"
+                raise UnsafeStimulus("net_charge_per_session", f"expected {expected}, got {got}")
 
     def _check_pace(self, event: Event, requested: History) -> None:
         """Check the limits on pace, after stimuli delivered and those `requested` before it."""
         limits, start_ns = self.limits, event.start_ns
         count = 1 + self._history.in_second_to(start_ns) + requested.in_second_to(start_ns)
         if count > limits.stimuli_per_s:
-            raise UnsafeStimulus(
-                "stimuli_per_s",
-                f"expected at most {limits.stimuli_per_s} stimuli in any second, got {count}: slow down",
-            )
+            expected = f"at most {limits.stimuli_per_s} stimuli in any second"
+            raise UnsafeStimulus("stimuli_per_s", f"expected {expected}, got {count}: slow down")
         for electrode in event.electrodes:
             last_ns = requested.last_on(electrode)
             last_ns = self._history.last_on(electrode) if last_ns is None else last_ns
             if last_ns is not None and start_ns - last_ns < round(limits.interval_us * 1000):
-                raise UnsafeStimulus(
-                    "interval_us",
-                    f"expected {limits.interval_us:g} us or more between stimulus starts on an electrode, got "
-                    f"{(start_ns - last_ns) / 1000:g} on electrode {electrode}: slow down",
-                )
+                got = f"{(start_ns - last_ns) / 1000:g} on electrode {electrode}: slow down"
+                expected = f"{limits.interval_us:g} us or more between stimulus starts on an electrode"
+                raise UnsafeStimulus("interval_us", f"expected {expected}, got {got}")
             count = 1 + sum(history.in_second_to(start_ns, electrode) for history in (self._history, requested))
             if count > limits.stimuli_per_electrode_s:
-                raise UnsafeStimulus(
-                    "stimuli_per_electrode_s",
-                    f"expected at most {limits.stimuli_per_electrode_s} stimuli on an electrode in any second, got "
-                    f"{count} on electrode {electrode}: slow down, or use more patterns",
-                )
+                got = f"{count} on electrode {electrode}: slow down, or use more patterns"
+                expected = f"at most {limits.stimuli_per_electrode_s} stimuli on an electrode in any second"
+                raise UnsafeStimulus("stimuli_per_electrode_s", f"expected {expected}, got {got}")

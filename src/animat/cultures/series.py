@@ -141,10 +141,8 @@ def record_series(
             if not file.exists():
                 write_nwb(recording, file)
             elif not read_recording(file).equals(recording):
-                raise Mismatch(
-                    f"{file}: expected the same as when recorded again, got a recording of another culture, protocol "
-                    "or version: remove it, or choose another folder"
-                )
+                remedy = "remove it, or choose another folder"
+                raise Mismatch(f"{file}: expected the same as when recorded again, got another recording: {remedy}")
             if virtual is not None:
                 # After the recording, so that the state is never ahead of a missing recording.
                 virtual.save_state(folder / STATE_FILE, sessions=session + 1)

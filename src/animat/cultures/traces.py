@@ -78,10 +78,8 @@ def record_traces(
     rate_hz = culture.sampling_rate_hz
     samples = round(duration_s * rate_hz) if 0 < duration_s < 1e6 else 0
     if not 0 < samples * len(rows) <= LARGEST_SAMPLES:
-        raise InvalidArgument(
-            f"duration_s, channels: expected up to {LARGEST_SAMPLES:,} samples, got {duration_s:g} s of {len(rows)} "
-            "channels: take a shorter stretch or fewer channels"
-        )
+        given = f"{duration_s:g} s of {len(rows)} channels: take a shorter stretch or fewer channels"
+        raise InvalidArgument(f"duration_s, channels: expected up to {LARGEST_SAMPLES:,} samples, got {given}")
     stimulus_time_s = culture.deliver(stimuli, duration_s).stimulus_time_s
     fired_s, fired = culture.fired
     rng = np.random.default_rng([seed, 14])

@@ -190,10 +190,8 @@ class VirtualCulture(ComputedCulture):
         tissue, visibility = self._grown()
         state = read_state(path, self.settings, tissue)
         if self._selection is not None and self._selection.to_dict() != state.selection.to_dict():
-            raise Mismatch(
-                f"{path}: expected the state of this culture, got another's, which differs in selection: use the same "
-                "electrodes, or start another culture in another folder"
-            )
+            remedy = "use the same electrodes, or start another culture in another folder"
+            raise Mismatch(f"{path}: expected this culture's state, got one which differs in selection: {remedy}")
         # Only now: a failed restore leaves the culture unchanged.
         self._tissue, self._visibility = tissue, visibility
         self._selection, self._zero_ns, self._now_ns = state.selection, state.zero_ns, state.now_ns

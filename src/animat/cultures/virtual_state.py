@@ -98,10 +98,8 @@ def read_state(path: Path, settings: Mapping[str, str], tissue: Tissue) -> Virtu
         raise
     except Exception as error:  # numpy, zipfile and zlib have a dozen kinds of errors for a damaged archive
         reason = f" ({error})" if isinstance(error, InvalidArgument) else ""
-        raise InvalidFile(
-            f"{path}: expected the whole state of a virtual culture, but it is damaged or something else{reason}: "
-            "choose another, or move it away to start again"
-        ) from error
+        what = f"it is damaged or something else{reason}: choose another, or move it away to start again"
+        raise InvalidFile(f"{path}: expected the whole state of a virtual culture, but {what}") from error
     return VirtualState(selection, zero_ns, now_ns, held_ns, held_neuron, snapshot, remarks)
 
 

@@ -89,10 +89,8 @@ def check_plan(
     if training.lessons or training.assess:
         raise InvalidArgument("lessons, assess: expected none, as the end of a live run is not known, got some")
     if (n := training.robot.n_commands) > 1:
-        raise InvalidArgument(
-            f"robot: expected one command, as a live run reads all channels as one, got {training.robot.name}, which "
-            f"takes {n}: record, train with --readouts, and run"
-        )
+        got = f"{training.robot.name}, which takes {n}: record, train with --readouts, and run"
+        raise InvalidArgument(f"robot: expected one command, as a live run reads all channels as one, got {got}")
     expect_trainable(training, is_saved=True)
     takes_min = minutes_of(protocol)
     if takes_min > timetable.interval_min:

@@ -135,10 +135,9 @@ class PlainColumns:
             raise UnusableData("spike_channel: expected rows (whole numbers), as there is no channel_label; got text")
         outside = values[(values < 0) | (values >= n_channels)]
         if len(outside) and self.channel_label is not None:
-            raise UnusableData(
-                f"spike_channel: expected rows from 0 to {n_channels - 1}, as these are numbers and channel_label is "
-                f"text, got {outside[0]}: write labels as text in both, or as numbers in both"
-            )
+            got = f"{outside[0]}: write labels as text in both, or as numbers in both"
+            why = "as these are numbers and channel_label is text"
+            raise UnusableData(f"spike_channel: expected rows from 0 to {n_channels - 1}, {why}, got {got}")
         return table, values.astype(np.int64)
 
     def _stimuli(self, time_s: Column, in_time: Column, noted: list[Finding]) -> tuple[Stimuli, dict[str, str]]:

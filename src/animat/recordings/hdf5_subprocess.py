@@ -43,10 +43,9 @@ def read_hdf5_in_subprocess(path: Path, *, part: str | None = None, stimuli: str
         except AnimatError:
             raise
         except (BrokenExecutor, TimeoutError) as error:
-            raise InvalidFile(
-                f"{path}: expected a complete HDF5 recording, but it is damaged: the HDF5 library crashed on it, or "
-                "took more time or memory than its size allows; copy or record it again"
-            ) from error
+            what = "the HDF5 library crashed on it, or took more time or memory than its size allows"
+            expected = "expected a complete HDF5 recording, but it is damaged"
+            raise InvalidFile(f"{path}: {expected}: {what}; copy or record it again") from error
         except Exception as error:
             raise InvalidFile(f"{path}: expected a recording, but it cannot be read ({first_line(error)})") from error
     return recording

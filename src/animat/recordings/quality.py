@@ -57,10 +57,8 @@ def _in_data(recording: Recording) -> Iterable[Finding]:
         message = f"the electrodes of {unknown:,} of {len(stimuli):,} stimuli are not known"
         yield Finding("stimulus-electrodes-unknown", "note", message, float(unknown))
     if len(stimuli) and recording.presentation is None:
-        message = (
-            "how the stimuli were presented (blocked or mixed, pulses per trial) is not known, so a closed loop "
-            "cannot check that it presents them in the same way"
-        )
+        how = "how the stimuli were presented (blocked or mixed, pulses per trial)"
+        message = f"{how} is not known, so a closed loop cannot check that it presents them in the same way"
         yield Finding("presentation-unknown", "note", message)
 
 
@@ -85,8 +83,8 @@ def _stimulus_rows(recording: Recording) -> Iterable[Finding]:
     if several := len(np.unique(trial[1:][differs & (np.diff(trial) == 0)])):
         message = (
             f"{several:,} of {np.count_nonzero(last):,} trials have pulses of several frequencies, and the response "
-            "counts for that of the last pulse: correct the frequencies or stimulus_presentation"
         )
+        message += "counts for that of the last pulse: correct the frequencies or stimulus_presentation"
         yield Finding("trials-of-several-frequencies", "warning", message, float(several))
 
 
@@ -95,10 +93,9 @@ def _duplicates(recording: Recording) -> Iterable[Finding]:
     same = (np.diff(recording.spike_times_s) == 0) & (np.diff(recording.spike_channels) == 0)
     n, share = int(np.count_nonzero(same)), float(np.mean(same)) if len(same) else 0.0
     if share > DUPLICATES[0] and n >= DUPLICATES[1]:
-        message = (
-            f"{n:,} of {len(recording.spike_times_s):,} spikes ({100 * share:.0f} %) come at exactly the same time as "
-            "another on their channel: are they in the file twice, or are times coarse? Each counts; provide them once"
-        )
+        same_as = f"({100 * share:.0f} %) come at exactly the same time as another on their channel"
+        asked = "are they in the file twice, or are times coarse? Each counts; provide them once"
+        message = f"{n:,} of {len(recording.spike_times_s):,} spikes {same_as}: {asked}"
         yield Finding("duplicate-spikes", "warning", message, share)
 
 
@@ -117,10 +114,9 @@ def _on_channels(recording: Recording) -> Iterator[Finding]:
     noisy = np.flatnonzero(fast | most)
     if len(noisy):
         share, names = float(count[noisy].sum() / n_spikes), channels.label[noisy].tolist()
-        message = (
-            f"channels that fire as no neuron does: {len(noisy):,} of {n:,} ({some_of(names, NAMED)}), "
-            f"with {100 * share:.0f} % of all spikes; raise their threshold or leave them out of the routing"
-        )
+        which = f"{len(noisy):,} of {n:,} ({some_of(names, NAMED)}), with {100 * share:.0f} % of all spikes"
+        remedy = "raise their threshold or leave them out of the routing"
+        message = f"channels that fire as no neuron does: {which}; {remedy}"
         yield Finding("noisy-channels", "warning" if share > 0.1 else "note", message, float(len(noisy)))
     yield from _stopped_channels(recording)
 
@@ -139,10 +135,8 @@ def _stopped_channels(recording: Recording) -> Iterator[Finding]:
     last_s = recording.start_s + part_s * until[stopped]
     first, last = f"{last_s.min():.0f} s", f"{last_s.max():.0f} s"
     when = f"at about {last}" if first == last else f"between {first} and {last}"
-    message = (
-        f"channels that fire steadily and then stop, {when}: {several:,} of {n:,} "
-        f"({some_of(recording.channels.label[stopped].tolist(), NAMED)}); they count in rates per channel: check their "
-        "contact, or leave them out of the routing"
-    )
+    which = f"{several:,} of {n:,} ({some_of(recording.channels.label[stopped].tolist(), NAMED)})"
+    remedy = "they count in rates per channel: check their contact, or leave them out of the routing"
+    message = f"channels that fire steadily and then stop, {when}: {which}; {remedy}"
     is_many = several > STOPPED_SHARE * np.count_nonzero(until)
     yield Finding("stopped-channels", "warning" if is_many else "note", message, float(several))

@@ -75,10 +75,8 @@ def read_recording(
             raise InvalidArgument(f"{name}: expected finite {unit}, got {start:g}")
     source = read_source(path, stimuli_path=stimuli_path, stimuli=stimuli, part=part)
     if isinstance(source, ResponseTable):
-        raise InvalidFile(
-            f"{path}: expected spikes, got a response table, which animat inspect, validate, train and evaluate read, "
-            "and in Python animat.read_source; this needs spike times"
-        )
+        reads = "animat inspect, validate, train and evaluate read, and in Python animat.read_source"
+        raise InvalidFile(f"{path}: expected spikes, got a response table, which {reads}; this needs spike times")
     with in_file(path):
         source = source if start_s is None else with_start(source, start_s)
         return source if start_min is None else dataclasses.replace(source, start_min=float(start_min))

@@ -116,10 +116,9 @@ class Recording:
         expect_rising_times("spike_times_s", self.spike_times_s)
         outside = (self.spike_channels < 0) | (self.spike_channels >= len(self.channels))
         if np.any(outside):
-            raise UnusableData(
-                f"spike_channels: expected rows of the channel table (0 to {len(self.channels) - 1}), "
-                f"got {self.spike_channels[outside][0]} ({np.count_nonzero(outside)} spikes on unknown channels)"
-            )
+            got = f"{self.spike_channels[outside][0]} ({np.count_nonzero(outside)} spikes on unknown channels)"
+            expected = f"rows of the channel table (0 to {len(self.channels) - 1})"
+            raise UnusableData(f"spike_channels: expected {expected}, got {got}")
         # Files store spikes by channel: without a fixed order of ties, a recording would not read back equal.
         if np.any((np.diff(self.spike_times_s) == 0) & (np.diff(self.spike_channels) < 0)):
             channels = self.spike_channels[np.lexsort((self.spike_channels, self.spike_times_s))]

@@ -173,10 +173,9 @@ def _impossible_firing(recording: Recording) -> str | None:
     stimulus_s = recording.stimuli.time_s
     soon_after = np.searchsorted(times_s, stimulus_s + SOON_S) - np.searchsorted(times_s, stimulus_s)
     if len(stimulus_s) >= ENOUGH_STIMULI and not np.any(soon_after):
-        return (
-            f"times cannot be in seconds: {hours} without a spike within {1e3 * SOON_S:g} ms after any of "
-            f"{len(stimulus_s):,} stimuli; are they in milliseconds, or spikes and stimuli in different units?"
-        )
+        without = f"without a spike within {1e3 * SOON_S:g} ms after any of {len(stimulus_s):,} stimuli"
+        asked = "are they in milliseconds, or spikes and stimuli in different units?"
+        return f"times cannot be in seconds: {hours} {without}; {asked}"
     return None
 
 
@@ -210,10 +209,9 @@ def _separate_clocks(recording: Recording) -> str | None:
     if max(after, before) < 0.9:
         return None
     where = f"after the last spike, {spike_s[-1]:g} s" if after > before else f"before the first, {spike_s[0]:g} s"
-    return (
-        f"times cannot all be in seconds: {100 * max(after, before):.0f} % of the stimuli come {where}: stimuli and "
-        "spikes have different units or clocks; provide both in seconds on the same clock"
-    )
+    share = f"{100 * max(after, before):.0f} % of the stimuli come {where}"
+    remedy = "stimuli and spikes have different units or clocks; provide both in seconds on the same clock"
+    return f"times cannot all be in seconds: {share}: {remedy}"
 
 
 def late_start(spike_time_s: np.ndarray, stimulus_time_s: np.ndarray) -> Iterator[Finding]:

@@ -37,10 +37,8 @@ def check_places(given: Any) -> Places:
     groups = [p for p in given if not (isinstance(p, str) and p == NONE)] if isinstance(given, list | tuple) else None
     is_listed = groups is not None and all(isinstance(place, list | tuple) and place for place in groups)
     if not is_listed or not all(type(e) is int and 0 <= e < 2**63 for place in groups or () for e in place):
-        raise InvalidArgument(
-            f"places: expected {', '.join(NAMED)}, or groups of electrode numbers such as [[1, 2], [3, 4]], one of "
-            f'which may be "{NONE}", got {shown(given)}'
-        )
+        lists = f'groups of electrode numbers such as [[1, 2], [3, 4]], one of which may be "{NONE}"'
+        raise InvalidArgument(f"places: expected {', '.join(NAMED)}, or {lists}, got {shown(given)}")
     places = tuple(NONE if place == NONE else tuple(sorted(set(place))) for place in given)
     if len(set(places)) < len(places) or len(places) > _MOST_PLACES:
         raise InvalidArgument(f"places: expected at most {_MOST_PLACES:,} groups, each once, got {shown(given)}")
@@ -89,10 +87,8 @@ def electrodes_of(
     unknown = np.count_nonzero(~np.isfinite(x_um + y_um))
     if unknown or len(electrodes) < count_places(places):
         missing = f"{unknown} of them unknown" if unknown else f"{len(electrodes)} electrodes"
-        raise InvalidArgument(
-            f"places: expected positions of {count_places(places)} stimulation electrodes or more to cut into "
-            f"{places}, got {missing}: list the electrodes of each place"
-        )
+        expected = f"positions of {count_places(places)} stimulation electrodes or more to cut into {places}"
+        raise InvalidArgument(f"places: expected {expected}, got {missing}: list the electrodes of each place")
     if places == "corners":
         y_of_um = dict(zip(electrodes.tolist(), y_um.tolist(), strict=True))
         halves = electrodes_of("halves", electrodes, x_um, y_um)

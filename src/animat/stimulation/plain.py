@@ -37,10 +37,8 @@ def seconds(name: str, value: Any) -> float:
         return value
     if isinstance(value, float) or (type(value) is not bool and isinstance(value, Integral)):
         return number(name, value)
-    raise InvalidArgument(
-        f"{name}: expected seconds as float64, which is Python's float, got {_kind(value)}: less precise times are "
-        "milliseconds off after some hours; compute them in float64"
-    )
+    why = "less precise times are milliseconds off after some hours; compute them in float64"
+    raise InvalidArgument(f"{name}: expected seconds as float64, which is Python's float, got {_kind(value)}: {why}")
 
 
 def _kind(value: Any) -> str:

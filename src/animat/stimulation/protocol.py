@@ -104,10 +104,9 @@ class Protocol:
             raise InvalidArgument(f"frequencies_hz: expected each once, got {listed}")
         object.__setattr__(self, "places", check_places(self.places))
         if not self.is_rest and max(self.frequencies_hz) * self.pulse.duration_us > 1e6:
-            raise InvalidArgument(
-                f"frequencies_hz: expected at most {1e6 / self.pulse.duration_us:.4g} Hz, as a pulse lasts "
-                f"{self.pulse.duration_us:g} us, got {max(self.frequencies_hz):g} Hz"
-            )
+            lasts_us, fastest_hz = self.pulse.duration_us, max(self.frequencies_hz)
+            expected = f"at most {1e6 / lasts_us:.4g} Hz, as a pulse lasts {lasts_us:g} us"
+            raise InvalidArgument(f"frequencies_hz: expected {expected}, got {fastest_hz:g} Hz")
         of_each = self.trials * self.pulses * max(1, self.n_places)
         pulses = len(self.frequencies_hz) * of_each
         if pulses > _MOST_PULSES:

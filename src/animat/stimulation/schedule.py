@@ -92,10 +92,8 @@ def make_schedule(
     if len(places) != protocol.n_places:
         raise InvalidArgument(f"places: expected electrodes of {protocol.n_places}, got those of {len(places)}")
     if not places and protocol.patterns > len(patterns):
-        raise InvalidArgument(
-            f"patterns: expected at most the {len(patterns)} that the culture's electrode selection has, got "
-            f"{protocol.patterns}: select more, or use fewer"
-        )
+        expected = f"at most the {len(patterns)} that the culture's electrode selection has"
+        raise InvalidArgument(f"patterns: expected {expected}, got {protocol.patterns}: select more, or use fewer")
     expect_at_least("seed", seed, 0)
     rng = np.random.default_rng([seed, 7])
     n_frequencies, trials = len(protocol.frequencies_hz), protocol.trials

@@ -57,10 +57,8 @@ def wire(mx: Any, selection: Selection, *, wait: Callable[[str], None]) -> Wirin
     array.route()
     amplifier_of = _routed(array)
     if lost := [electrode for electrode in stimulation if electrode not in amplifier_of]:
-        raise DeviceFailed(
-            f"MaxOne: expected all {len(stimulation)} stimulation electrodes to be routed, but not {_named(lost)}: "
-            "choose others nearby, or fewer recording electrodes"
-        )
+        lack = f"but not {_named(lost)}: choose others nearby, or fewer recording electrodes"
+        raise DeviceFailed(f"MaxOne: expected all {len(stimulation)} stimulation electrodes to be routed, {lack}")
     unit_of = _connect(array, stimulation)
     array.download()
     wait("waitAfterDownload")

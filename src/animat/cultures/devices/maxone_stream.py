@@ -131,10 +131,8 @@ class ZmqSpikes:
             raise DeviceFailed(f"MaxOne: expected a frame's number in 8 bytes, got {len(parts[0])}")
         number = int(np.frombuffer(parts[0], FRAME)[0])
         if number < self._frame:
-            raise DeviceFailed(
-                f"MaxOne: expected frames after {self._frame}, got {number}: MaxLab Live's server was restarted, and "
-                "no wait for a later frame would end; close and open again"
-            )
+            why = "MaxLab Live's server was restarted; close and open again"
+            raise DeviceFailed(f"MaxOne: expected frames after {self._frame}, got {number}: {why}")
         if len(parts) > 2 and parts[2]:
             self._spikes.extend(self._read(parts[2], number))
         if self._frame >= 0 and number > self._frame + 1:

@@ -178,10 +178,8 @@ class TissueParameters:
         n_inhibitory = self.neurons - self.n_excitatory
         for degree, available in ((self.in_degree_e, self.n_excitatory), (self.in_degree_i, n_inhibitory)):
             if not 0 <= degree < available:
-                raise InvalidArgument(
-                    f"in_degree_e, in_degree_i: expected fewer synapses than the {available} neurons of that type, "
-                    f"got {degree}: lower it or raise neurons"
-                )
+                expected = f"expected fewer synapses than the {available} neurons of that type"
+                raise InvalidArgument(f"in_degree_e, in_degree_i: {expected}, got {degree}")
 
     @property
     def scaling_rest(self) -> float:

@@ -76,10 +76,9 @@ def detect_spikes(
     """
     settings, progress, rate_hz = settings or Detection(), progress or Silent(), traces.sampling_rate_hz
     if settings.band_hz is not None and settings.band_hz[1] >= rate_hz / 2:
-        raise InvalidArgument(
-            f"band_hz: expected less than half the sampling rate of {rate_hz:g} Hz, got {settings.band_hz[1]:g} Hz: "
-            f"choose a lower upper end, such as {0.4 * rate_hz:g}"
-        )
+        expected = f"less than half the sampling rate of {rate_hz:g} Hz"
+        got = f"{settings.band_hz[1]:g} Hz: choose a lower upper end, such as {0.4 * rate_hz:g}"
+        raise InvalidArgument(f"band_hz: expected {expected}, got {got}")
     times_s = np.asarray([] if stimulus_time_s is None else stimulus_time_s, np.float64)
     # Simultaneous pulses are one.
     stimulus = np.unique(np.rint((times_s - traces.start_s) * rate_hz)).astype(np.int64)
@@ -272,16 +271,12 @@ def _findings(noise_uv: Levels, n_stimuli: int, saturation: np.ndarray, settings
     yield Finding("noise", "note", f"noise: {middle:.2f} uV on the median of {n:,} channels; spikes are negative "
                   f"peaks of {settings.threshold:g} times their channel's noise and more", middle)  # fmt: skip
     if dead := int(np.count_nonzero(is_dead(noise_uv))):
-        message = (
-            f"dead channels (less than {DEAD:g} of the median noise): {dead:,} of {n:,}; no spike can be detected on "
-            "them, and they count in rates per channel; leave them out of the routing next time"
-        )
+        what = "no spike can be detected there, and they count in rates per channel; leave them out of the routing"
+        message = f"dead channels (less than {DEAD:g} of the median noise): {dead:,} of {n:,}; {what}"
         yield Finding("dead-channels", "note" if dead < 0.1 * n else "warning", message, float(dead))
     if middle > 0 and (noisy := int(np.count_nonzero(noise_uv > NOISY * middle))):
-        message = (
-            f"noisy channels (more than {NOISY:g} times the median noise): {noisy:,} of {n:,}; only large spikes are "
-            "detected there; look for loose contacts or air bubbles"
-        )
+        what = "only large spikes are detected there; look for loose contacts or air bubbles"
+        message = f"noisy channels (more than {NOISY:g} times the median noise): {noisy:,} of {n:,}; {what}"
         yield Finding("noisy-channels", "note" if noisy < 0.1 * n else "warning", message, float(noisy))
     if n_stimuli:
         before, after = settings.blank_ms

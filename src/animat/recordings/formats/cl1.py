@@ -31,10 +31,8 @@ def read_cl1(file: Hdf5File, *, spikes: bool = True) -> Recording:
     """Read spikes, which must exist, and stimuli of an open CL1 recording; or only stimuli, for raw traces."""
     findings: list[Finding] = []
     if spikes and not file.has("spikes"):
-        raise InvalidFile(
-            f"{file.path}: expected spikes at /spikes, found none: it was recorded with include_spikes=False; detect "
-            "them in its raw traces with animat convert --raw"
-        )
+        remedy = "it was recorded with include_spikes=False; detect them in its raw traces with animat convert --raw"
+        raise InvalidFile(f"{file.path}: expected spikes at /spikes, found none: {remedy}")
     rates_hz = [file.attribute("/", name) for name in ("frames_per_second", "sampling_frequency")]
     rate_hz = next((float(rate) for rate in rates_hz if is_positive(rate)), None)
     if rate_hz is None:

@@ -51,8 +51,8 @@ def read_csv(table: TextTable, stimuli_path: str | os.PathLike[str] | None = Non
         looked_for = " or ".join(file.name for file in _stimuli_beside(path))
         message = (
             f"{path.name} has {len(table.rows):,} spikes but no stimuli, so there are no responses to learn from: "
-            f"{looked_for} was looked for; rename the stimulus file accordingly"
         )
+        message += f"{looked_for} was looked for; rename the stimulus file accordingly"
         findings = [*findings, Finding("no-stimuli", "refuse", message)]
     else:
         stimulus_table = read_table(stimuli, "stimulus_time_s")
@@ -89,16 +89,13 @@ def _columns(table: TextTable, known: Mapping[str, tuple[str, ...]]) -> dict[str
             # It may be a response table in which one of these is misspelt.
             others = ("channel", "count", "rate_hz") if name == "spike_time_s" else ()
             found = some_of([repr(head)[1:-1][:40] for head in table.header], 12)
-            raise InvalidFile(
-                f"{table.path}, line 1: expected a column named {' or '.join(names)}, found {found}"
-                f"{_advice(table, name) or nearest(table, (*names, *others))}"
-            )
+            expected = f"expected a column named {' or '.join(names)}"
+            advice = _advice(table, name) or nearest(table, (*names, *others))
+            raise InvalidFile(f"{table.path}, line 1: {expected}, found {found}{advice}")
     heads = [head for head in table.header if folded(head) in known.get("spike_channel", ())]
     if len(heads) > 1:
-        raise InvalidFile(
-            f"{table.path}, line 1: expected one column of {' or '.join(known['spike_channel'])}, got "
-            f"{' and '.join(heads)}: remove one (each unit is a channel)"
-        )
+        expected, got = " or ".join(known["spike_channel"]), " and ".join(heads)
+        raise InvalidFile(f"{table.path}, line 1: expected one column of {expected}, got {got}: remove one")
     columns = {name: plain_column(table, place, name) for name, place in places.items()}
     table.note_left_out([alias for name, names in known.items() if name not in places for alias in names])
     return columns

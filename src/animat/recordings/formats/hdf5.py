@@ -51,10 +51,8 @@ class Hdf5File:
             if link is None:
                 return None
             if isinstance(link, h5py.ExternalLink):
-                raise InvalidFile(
-                    f"{self.path}: expected data in the file itself, but {where} is a link to another file, which is "
-                    "never followed; copy all data into one file"
-                )
+                link = f"{where} is a link to another file, which is never followed"
+                raise InvalidFile(f"{self.path}: expected data in the file itself, but {link}: copy all into one")
             if isinstance(link, h5py.SoftLink):
                 hops += 1
                 if hops > SOFT_LINKS:
@@ -88,10 +86,8 @@ class Hdf5File:
             raise InvalidFile(f"{self.path}: expected a dataset at {where}, found {'a group' if node else 'nothing'}")
         created = node.id.get_create_plist()
         if created.get_external_count() > 0 or created.get_layout() == h5py.h5d.VIRTUAL:
-            raise InvalidFile(
-                f"{self.path}: expected the values of {where} in the file itself, but they are in other files, which "
-                "are never opened; copy all data into one file"
-            )
+            what = "they are in other files, which are never opened; copy all data into one file"
+            raise InvalidFile(f"{self.path}: expected the values of {where} in the file itself, but {what}")
         if node.shape is None:
             raise InvalidFile(f"{self.path}: expected values at {where}, got an empty dataspace")
         # HDF5 reads whole chunks, and raw traces are read in the program's own process.
@@ -193,10 +189,8 @@ def hdf5_file(path: Path) -> Iterator[Hdf5File]:
         # The file is not damaged; its contents are invalid.
         raise InvalidFile(f"{path}: {error}") from error
     except DAMAGE as error:
-        raise InvalidFile(
-            f"{path}: expected a complete HDF5 recording, but it is cut off or damaged ({first_line(error)}); "
-            "copy or record it again"
-        ) from error
+        what = f"it is cut off or damaged ({first_line(error)}); copy or record it again"
+        raise InvalidFile(f"{path}: expected a complete HDF5 recording, but {what}") from error
 
 
 def is_positive(value: Any) -> bool:

@@ -35,10 +35,8 @@ def _format_of(file: Hdf5File) -> Literal["NWB", "MaxWell", "CL1"]:
         return "MaxWell"
     if is_cl1(file):
         return "CL1"
-    raise InvalidFile(
-        f"{file.path}: expected NWB, MaxWell or CL1, got another HDF5 file (it holds: "
-        f"{some_of(file.names('/'), 5) or 'nothing'}); save its columns as NPZ or CSV"
-    )
+    found = f"another HDF5 file (it holds: {some_of(file.names('/'), 5) or 'nothing'})"
+    raise InvalidFile(f"{file.path}: expected NWB, MaxWell or CL1, got {found}; save its columns as NPZ or CSV")
 
 
 def read_hdf5(path: Path, *, part: str | None = None, stimuli: str | None = None) -> Recording:
@@ -182,10 +180,8 @@ def _traces(
     if dataset.ndim != 2 or dataset.dtype.kind not in "iuf":
         raise InvalidFile(f"{path}: expected traces by channel at /{where}, got {dataset.shape} {dataset.dtype}")
     if missing := unavailable_filters(dataset):
-        raise InvalidFile(
-            f"{path}: the raw traces at /{where} are compressed by {missing}, which is not installed: {PLUGIN_ADVICE}; "
-            "spikes detected by the rig can be read without it"
-        )
+        remedy = f"{PLUGIN_ADVICE}; spikes detected by the rig can be read without it"
+        raise InvalidFile(f"{path}: /{where} is compressed by {missing}, which is not installed: {remedy}")
     samples, columns = dataset.shape[::-1] if channels_first else dataset.shape
     if isinstance(uv_per_step, np.ndarray) and len(uv_per_step) != columns:
         raise InvalidFile(f"{path}: expected a conversion of each of the {columns} traces, got {len(uv_per_step)}")

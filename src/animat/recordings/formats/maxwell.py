@@ -69,10 +69,8 @@ def read_maxwell(
     layout = _old(file) if is_old(file) else _new(file, part)
     findings, rate_hz = layout.findings, layout.rate_hz
     if spikes and not file.has(layout.spikes):
-        raise InvalidFile(
-            f"{file.path}: expected spikes at /{layout.spikes}, found none: the rig kept raw traces only, or nothing; "
-            "detect spikes in them with animat convert --raw"
-        )
+        remedy = "the rig kept raw traces only, or nothing; detect spikes in them with animat convert --raw"
+        raise InvalidFile(f"{file.path}: expected spikes at /{layout.spikes}, found none: {remedy}")
     spike_frame, spike_channel = file.columns(layout.spikes, "frameno", "channel") if spikes else np.empty((2, 0), int)
     stimulus_frame, columns = np.empty(0, np.int64), dict[str, Any]()
     if file.has(layout.stimuli):
@@ -197,10 +195,8 @@ def _channels(file: Hdf5File, layout: _Layout, spike_channel: Column) -> dict[st
     recorded, findings = layout.recorded_channels, layout.findings
     if not file.has(layout.mapping):
         labels = np.unique(spike_channel if recorded is None else recorded)
-        message = (
-            f"the file has no /{layout.mapping}: the electrodes of channels are not known; {len(labels):,} channels "
-            "are " + ("those that fired" if recorded is None else "taken from its groups")
-        )
+        which = f"{len(labels):,} channels are {'those that fired' if recorded is None else 'taken from its groups'}"
+        message = f"the file has no /{layout.mapping}: the electrodes of channels are not known; {which}"
         findings.append(Finding("mapping-missing", "warning" if recorded is None else "note", message))
         return {"channel_label": labels, "channel_electrode": np.full(len(labels), UNKNOWN)}
     channel, electrode = (file.read(layout.mapping, name).astype(np.int64) for name in ("channel", "electrode"))

@@ -85,10 +85,8 @@ def load_columns(path: Path, known: tuple[str, ...]) -> tuple[dict[str, Any], li
         what = "pickled objects, which are never read" if pickled else f"a damaged array ({first_line(error)})"
         raise InvalidFile(f"{path}: expected plain arrays of numbers or text, got {what}; save it again") from error
     except (OSError, EOFError, KeyError, MemoryError, NotImplementedError, zipfile.BadZipFile, zlib.error) as error:
-        raise InvalidFile(
-            f"{path}: expected a complete NPZ archive, but it is cut off or damaged ({first_line(error)}); "
-            "copy or save it again"
-        ) from error
+        what = f"it is cut off or damaged ({first_line(error)}); copy or save it again"
+        raise InvalidFile(f"{path}: expected a complete NPZ archive, but {what}") from error
     return columns, keys, left_out
 
 

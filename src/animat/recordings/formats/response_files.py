@@ -96,10 +96,8 @@ def _wide(table: TextTable) -> _Read:
     places = {kind: [i for i, h in enumerate(table.header) if folded(h).startswith(f"{kind}_")] for kind in KINDS}
     kinds = [kind for kind in KINDS if places[kind]]
     if len(kinds) != 1:
-        raise InvalidFile(
-            f"{table.path}, line 1: expected a column count_CHANNEL or rate_hz_CHANNEL for each channel, "
-            f"got {'both' if kinds else 'neither'}"
-        )
+        expected = "expected a column count_CHANNEL or rate_hz_CHANNEL for each channel"
+        raise InvalidFile(f"{table.path}, line 1: {expected}, got {'both' if kinds else 'neither'}")
     kind = kinds[0]
     labels = np.array([_label(table.header[i], kind) for i in places[kind]], dtype=np.str_)
     values = np.column_stack([table.numbers(i, table.header[i], required=True) for i in places[kind]])
