@@ -53,8 +53,8 @@ class SessionData:
         self.spike_counts = SpikeCounts(len(header.channels))
         self._header = header
         # One entry per pulse, in columns: half a million take 50 MB instead of a gigabyte.
-        self._time_s, self._frequency_hz = array("d"), array("d")
-        self._pattern, self._presentation = array("q"), array("q")
+        kinds = {"frequency_hz": "d", "pattern": "q", "presentation": "q", "time_s": "d"}
+        self._columns = {name: array(kind) for name, kind in kinds.items()}
         self._electrodes, self._widths = array("q"), array("q")
         self._watched_s = self._end_s = 0.0
 
@@ -62,14 +62,13 @@ class SessionData:
         self.outline.add(fields)
         if fields["kind"] != "seen":
             return
-        for frequency_hz, pattern, presentation, electrodes in fields["stimuli"]:
-            self._frequency_hz.append(frequency_hz)
-            self._pattern.append(pattern)
-            self._presentation.append(presentation)
+        for *values, electrodes in fields["stimuli"]:
+            for name, value in zip(("frequency_hz", "pattern", "presentation"), values, strict=True):
+                self._columns[name].append(value)
             self._electrodes.extend(electrodes)
             self._widths.append(len(electrodes))
         if fields["tick"]:
-            self._time_s.extend(fields["tick"]["pulse_time_s"])
+            self._columns["time_s"].extend(fields["tick"]["pulse_time_s"])
         self._watched_s += fields["duration_s"]
         self._end_s = max(self._end_s, fields["start_s"] + fields["duration_s"])
 
@@ -88,7 +87,7 @@ class SessionData:
         }
         if outline.left_out:
             metadata["left_out"] = describe_left_out(outline.left_out)
-        duration_s = max(self._end_s, self.spike_counts.span_s[1], *self._time_s[-1:])
+        duration_s = max(self._end_s, self.spike_counts.span_s[1], *self._columns["time_s"][-1:])
         metadata["closed_loop_unwatched_s"] = f"{max(0.0, duration_s - self._watched_s):.6f}"
         return Recording(
             spike_times_s=[],  # type: ignore[arg-type]
@@ -107,13 +106,7 @@ class SessionData:
         widths = np.array(self._widths, np.int64)
         electrodes = np.full((len(widths), int(np.max(widths)) if len(widths) else 1), UNKNOWN)
         electrodes[np.arange(electrodes.shape[1])[None, :] < widths[:, None]] = self._electrodes
-        return Stimuli(
-            time_s=np.array(self._time_s, np.float64),
-            frequency_hz=np.array(self._frequency_hz, np.float64),
-            pattern=np.array(self._pattern, np.int64),
-            electrodes=electrodes,
-            presentation=np.array(self._presentation, np.int64),
-        )
+        return Stimuli(electrodes=electrodes, **{name: np.array(values) for name, values in self._columns.items()})
 
 
 @dataclass(frozen=True, eq=False)

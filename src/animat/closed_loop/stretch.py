@@ -21,6 +21,9 @@ from animat.recordings.recording import Channels
 from animat.responses.windows import read_windows
 from animat.stimulation.stimulus import Stimulus
 
+Times = Float64[np.ndarray, " stimuli"]
+Drawn = Float64[np.ndarray, "responses *readouts"]
+Members = Bool[np.ndarray, "readouts channels"]
 _MOST_CUT_S = 0.001
 """By how much a response window may be cut: a device may report a pulse a few samples after it was due."""
 
@@ -43,7 +46,7 @@ class Stretch:
     spike_times_s: Float64[np.ndarray, " spikes"]
     spike_channels: Int64[np.ndarray, " spikes"]
     channels: Channels
-    stimulus_time_s: Float64[np.ndarray, " stimuli"]
+    stimulus_time_s: Times
 
 
 def request_fields(number: int, at_s: float, stimuli: Sequence[Stimulus]) -> dict[str, Any]:
@@ -67,7 +70,7 @@ def stretch_record(stretch: Stretch, stimuli: Sequence[Stimulus], tick: dict[str
 def check_answer(
     observed: Observed,
     *,
-    requested_s: Float64[np.ndarray, " stimuli"],
+    requested_s: Times,
     duration_s: float,
     since_s: float,
     from_s: float,
@@ -76,12 +79,8 @@ def check_answer(
 ) -> str | None:
     """What is wrong with an answer of the culture, in a sentence; None for a possible one.
 
-    Args:
-        requested_s: requested times of the stimuli, counted from `since_s`: none may begin earlier.
-        duration_s: requested duration, which the answer must cover at least.
-        since_s: time of the request, on the culture's clock.
-        from_s: earliest possible start of the answer, on the culture's clock.
-        sample_s: duration of a sample; times may be rounded to whole samples.
+    It was requested at `since_s` on the culture's clock, and may start at `from_s` at the earliest. Stimuli begin at
+    the times requested or later, but for rounding to samples, and the answer covers at least the duration.
     """
     try:
         times_s, channel = observed.spikes
@@ -136,12 +135,7 @@ def _is_lost(error: BaseException | None) -> bool:
 
 
 def read_response(
-    loop: Loop,
-    drawn_from: Float64[np.ndarray, "responses *readouts"] | None,
-    stretch: Stretch,
-    members: Bool[np.ndarray, "readouts channels"],
-    after_s: Float64[np.ndarray, "1"],
-    rng: np.random.Generator,
+    loop: Loop, drawn_from: Drawn | None, stretch: Stretch, members: Members, after_s: Times, rng: np.random.Generator
 ) -> tuple[Float64[np.ndarray, "*readouts"], dict[str, Any]]:
     """The response after a pulse, or one drawn in its place: x of each readout, Hz, and the fields of its tick."""
     rate_hz, active_ratio = read_windows(stretch, after_s, loop.window_ms)

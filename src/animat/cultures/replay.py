@@ -16,6 +16,7 @@ from animat.errors import InvalidArgument, Mismatch, UnusableData, expect_at_lea
 from animat.recordings.recorded_culture import RecordedCulture
 from animat.recordings.recording import Channels, Recording
 from animat.stimulation.frequency import distinct, is_same
+from animat.stimulation.patterns import Patterns
 from animat.stimulation.stimulus import Stimulus, is_last_of
 from animat.tables import UNKNOWN
 
@@ -87,7 +88,7 @@ class ReplayCulture(ComputedCulture):
         return tuple(stimulated[stimulated != UNKNOWN].tolist())
 
     @property
-    def patterns(self) -> Int64[np.ndarray, "patterns size"]:
+    def patterns(self) -> Patterns:
         return self._patterns
 
     @property
@@ -130,12 +131,8 @@ class ReplayCulture(ComputedCulture):
         spikes = Spikes((self._pending_ns[:known] - start_ns) / NS, self._pending_channel[:known])
         self._pending_ns, self._pending_channel = self._pending_ns[known:], self._pending_channel[known:]
         self._now_ns = end_ns
-        return Observed(
-            start_s=self._zero_s + start_ns / NS,
-            duration_s=(end_ns - start_ns) / NS,
-            spikes=spikes,
-            stimulus_time_s=np.array([time_ns - start_ns for time_ns, _ in answers], dtype=np.float64) / NS,
-        )
+        stimulus_s = np.array([time_ns - start_ns for time_ns, _ in answers], dtype=np.float64) / NS
+        return Observed(self._zero_s + start_ns / NS, (end_ns - start_ns) / NS, spikes, stimulus_s)
 
     def _pool(self, stimulus: Stimulus, is_last: bool) -> tuple[Recording, Int64[np.ndarray, " pulses"]]:
         """The recorded pulses that may answer, and their recording."""
@@ -170,7 +167,7 @@ class ReplayCulture(ComputedCulture):
         self._pending_ns, self._pending_channel = self._pending_ns[kept], self._pending_channel[kept]
 
 
-def _patterns(recording: Recording) -> Int64[np.ndarray, "patterns size"]:
+def _patterns(recording: Recording) -> Patterns:
     """Electrodes of each pattern, by number; if patterns have no numbers, each distinct set is a pattern."""
     stimuli = recording.stimuli
     has_electrodes = np.any(stimuli.electrodes != UNKNOWN, axis=1)
@@ -181,9 +178,7 @@ def _patterns(recording: Recording) -> Int64[np.ndarray, "patterns size"]:
     return np.asarray(np.unique(stimuli.electrodes[has_electrodes], axis=0))
 
 
-def _numbered_sets(
-    electrodes: Int64[np.ndarray, "pulses size"],
-) -> tuple[dict[frozenset[int], int], Int64[np.ndarray, " pulses"]]:
+def _numbered_sets(electrodes: Patterns) -> tuple[dict[frozenset[int], int], Int64[np.ndarray, " pulses"]]:
     """A number for each set of electrodes, and the number of each pulse's set."""
     rows, number = np.unique(np.sort(electrodes, axis=1), axis=0, return_inverse=True)
     return {frozenset(row) - {UNKNOWN}: i for i, row in enumerate(rows.tolist())}, number.reshape(-1)

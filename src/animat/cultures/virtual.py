@@ -269,13 +269,10 @@ class VirtualCulture(ComputedCulture):
         self._now_ns = end_ns
         time_s, neuron = (time_ns_of[:known] - start_ns) / NS, neuron[:known]
         self.fired = time_s, neuron
-        return Observed(
-            start_s=(start_ns - self._zero_ns) / NS,
-            duration_s=(end_ns - start_ns) / NS,
-            # Each spike, repeated on every channel that sees its neuron.
-            spikes=Spikes(time_s.repeat(self._n_seen_by[neuron]), self._seen_by[neuron][self._is_seen[neuron]]),
-            stimulus_time_s=np.array(stimulus_ns, dtype=np.float64) / NS,
-        )
+        # Each spike, repeated on every channel that sees its neuron.
+        spikes = Spikes(time_s.repeat(self._n_seen_by[neuron]), self._seen_by[neuron][self._is_seen[neuron]])
+        stimulus_s = np.array(stimulus_ns, dtype=np.float64) / NS
+        return Observed((start_ns - self._zero_ns) / NS, (end_ns - start_ns) / NS, spikes, stimulus_s)
 
     def _rest(self, duration_s: float) -> None:
         now_ns, tissue = self._now_ns + round(duration_s * NS), self.tissue

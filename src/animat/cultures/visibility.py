@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-from animat.stimulation.array import ElectrodeArray
+from animat.stimulation.array import ElectrodeArray, Electrodes
 from animat.stimulation.scan import ScannedActivity
 
 REACH_UM = 25.0
@@ -53,7 +53,7 @@ class Visibility:
         self.recovery_ms = np.clip(recovery_ms, 0.1, 0.9)
         self.pairs = _find_pairs(array, x_um, y_um)
 
-    def pairs_of(self, electrodes: Int64[np.ndarray, " electrodes"]) -> Pairs:
+    def pairs_of(self, electrodes: Electrodes) -> Pairs:
         """The pairs of some electrodes, in their order; `electrode` becomes the row in `electrodes`."""
         first = np.searchsorted(self.pairs.electrode, electrodes, side="left")
         counts = np.searchsorted(self.pairs.electrode, electrodes, side="right") - first
@@ -67,7 +67,7 @@ class Visibility:
 
     def measure(
         self,
-        electrodes: Int64[np.ndarray, " electrodes"],
+        electrodes: Electrodes,
         spikes_of: Int64[np.ndarray, " neurons"],
         duration_s: float,
         rng: np.random.Generator,

@@ -281,13 +281,8 @@ class _Run:
             self.write("unusable", file=file.name, message=str(error))
             return None
         self.used = series
-        self.write(
-            "recording",
-            file=file.name,
-            number=number,
-            took_s=round(time.monotonic() - began_s, 2),
-            budget=self.account.to_dict(),
-        )
+        took_s = round(time.monotonic() - began_s, 2)
+        self.write("recording", file=file.name, number=number, took_s=took_s, budget=self.account.to_dict())
         return timeline
 
     def keep_state(self) -> None:

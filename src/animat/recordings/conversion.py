@@ -217,11 +217,5 @@ def _with_detected_spikes(
         findings.append(Finding("stimuli-outside", "warning", message, float(outside)))
     # Rounding may put a spike's sample an ulp outside the span.
     time_s = np.clip(detected.time_s, base.start_s, base.stop_s)
-    return replace(
-        base,
-        spike_times_s=time_s,
-        spike_channels=detected.channel,
-        sampling_rate_hz=traces.sampling_rate_hz,
-        provenance={**base.provenance, "spikes": how},
-        findings=merged(findings),
-    )
+    spikes = {"spike_times_s": time_s, "spike_channels": detected.channel, "sampling_rate_hz": traces.sampling_rate_hz}
+    return replace(base, **spikes, provenance={**base.provenance, "spikes": how}, findings=merged(findings))

@@ -22,6 +22,7 @@ SETTLE_MS = 0.25
 PAUSE_MS = 1.0
 """How long the trace of an amplifier that has been saturated for more than `recovery_ms` may move in between."""
 
+Rows = Float64[np.ndarray, "rows samples"]
 Traces = Float32[np.ndarray, "channels samples"]
 Flags = Bool[np.ndarray, "channels samples"]
 Levels = Float32[np.ndarray, " channels"]
@@ -179,11 +180,7 @@ def _subtract_recovery(
         voltage_uv[rows, start:stop] -= exponential.astype(np.float32)
 
 
-def _fitted(
-    trace_uv: Float64[np.ndarray, "rows samples"],
-    t_ms: Float64[np.ndarray, " samples"],
-    noise_uv: Float32[np.ndarray, " rows"],
-) -> Float64[np.ndarray, "rows samples"]:
+def _fitted(trace_uv: Rows, t_ms: Float64[np.ndarray, " samples"], noise_uv: Float32[np.ndarray, " rows"]) -> Rows:
     """The exponential a exp(-k t) of the robust least-squares fit a exp(-k t) + b to each row.
 
     Gauss-Newton steps on a, k and b start from the best of a few k. Residuals are clipped at four standard deviations
