@@ -286,11 +286,9 @@ def _expect_no_loss(session: Session) -> None:
     with open_file(session.ticks_file) as table:
         written = sum(1 for _ in table) - 1
     if written > session.outline.ticks:
-        raise Mismatch(
-            f"{session.ticks_file}: expected no more ticks than the log has, which is damaged after "
-            f"{session.outline.ticks}, got {written}; move {RECORDING_FILE} and {TICKS_FILE} away to recover what the "
-            "log has"
-        )
+        remedy = f"move {RECORDING_FILE} and {TICKS_FILE} away to recover what the log has"
+        expected = f"no more ticks than the log has, which is damaged after {session.outline.ticks}"
+        raise Mismatch(f"{session.ticks_file}: expected {expected}, got {written}; {remedy}")
 
 
 def lost_message(lost_bytes: int) -> str:

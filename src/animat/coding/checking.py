@@ -48,10 +48,8 @@ def _check_commands(mapping: Mapping) -> None:
             raise InvalidArgument(f"{expected} commands from -1 to 1{where}, got {u[i]:g} at {_RESPONSES_HZ[i]:g} Hz")
         if falls := np.flatnonzero(np.diff(u) < 0).tolist():
             i = falls[0]
-            raise InvalidArgument(
-                f"{expected} commands that never fall as the response rises{where}, got {u[i]:g} at "
-                f"{_RESPONSES_HZ[i]:g} Hz and {u[i + 1]:g} at {_RESPONSES_HZ[i + 1]:g} Hz"
-            )
+            falls_hz = f"{u[i]:g} at {_RESPONSES_HZ[i]:g} Hz and {u[i + 1]:g} at {_RESPONSES_HZ[i + 1]:g} Hz"
+            raise InvalidArgument(f"{expected} commands that never fall as the response rises{where}, got {falls_hz}")
         for i in (0, -1):
             one = _results(mapping.command, _RESPONSES_HZ[i], percentiles, f"{expected} commands")
             if one.shape != () or one != u[i]:

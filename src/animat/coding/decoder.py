@@ -51,10 +51,9 @@ def expect_fit(robot: str, n_commands: int, readouts: int) -> None:
     """Raise InvalidArgument if the number of readouts differs from the number of commands that a robot takes."""
     # An invalid number of commands is reported by the check of the robot.
     if type(n_commands) is int and n_commands > 0 and n_commands != readouts:
-        raise InvalidArgument(
-            f"readouts: expected {n_commands}, one for each command of {robot}, got {readouts}; halves are two, "
-            "quadrants four, a file of electrode groups as many as it has groups (animat train --readouts)"
-        )
+        advice = "halves are two, quadrants four, a file as many as it has groups (animat train --readouts)"
+        expected = f"{n_commands}, one for each command of {robot}"
+        raise InvalidArgument(f"readouts: expected {expected}, got {readouts}; {advice}")
 
 
 def expect_one_command(robot: str, n_commands: int) -> None:

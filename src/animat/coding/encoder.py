@@ -40,20 +40,18 @@ class Encoder:
         if not self.conditions:
             raise InvalidArgument("conditions: expected at least one, got none")
         for condition in self.conditions:
+            expected = f"condition {condition.label}: expected recordings that state the"
             if not condition.frequencies_hz:
-                raise UnusableData(
-                    f"condition {condition.label}: expected recordings that state the frequency of its pulses, which a "
-                    "closed loop needs, got none; sort the stimuli by their intervals too: --conditions "
-                    "'interval:5,10 x electrode'"
-                )
+                remedy = "sort the stimuli by their intervals too: --conditions 'interval:5,10 x electrode'"
+                raise UnusableData(f"{expected} frequency of its pulses, which a closed loop needs, got none; {remedy}")
             if not all(SLOWEST_HZ <= each <= FASTEST_HZ for each in condition.frequencies_hz):
                 given = ", ".join(f"{f:g}" for f in condition.frequencies_hz)
-                expected = f"a frequency from {SLOWEST_HZ:g} to {FASTEST_HZ:g} Hz for a closed loop"
-                raise UnusableData(f"condition {condition.label}: expected {expected}, got {given}")
+                needed = f"a frequency from {SLOWEST_HZ:g} to {FASTEST_HZ:g} Hz for a closed loop"
+                raise UnusableData(f"condition {condition.label}: expected {needed}, got {given}")
             if condition.electrodes == ():
+                remedy = "train on conditions by frequency or interval"
                 raise UnusableData(
-                    f"condition {condition.label}: expected recordings that state the electrodes of its pulses, which "
-                    "a closed loop needs, got none; train on conditions by frequency or interval"
+                    f"{expected} electrodes of its pulses, which a closed loop needs, got none; {remedy}"
                 )
         slowest_hz = min(min(condition.frequencies_hz) for condition in self.conditions)
         if self.pulses > slowest_hz / SLOWEST_HZ:
@@ -160,9 +158,8 @@ def expect_electrode_pulses(conditions: Sequence[Condition], pulses: int) -> tup
     """The same where the cost is required; raises UnusableData if they are not known."""
     counts = electrode_pulses(conditions, pulses)
     if counts is None:
-        raise UnusableData(
-            "pulse_cost: expected conditions that state the electrodes of all their pulses, got "
-            f"{', '.join(condition.label for condition in conditions)}; record places of several sizes, or leave the "
-            "cost out"
-        )
+        labels = ", ".join(condition.label for condition in conditions)
+        expected = "conditions that state the electrodes of all their pulses"
+        remedy = "record places of several sizes, or leave the cost out"
+        raise UnusableData(f"pulse_cost: expected {expected}, got {labels}; {remedy}")
     return counts

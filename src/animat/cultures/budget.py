@@ -85,19 +85,15 @@ class Account:
 
     def to_dict(self) -> dict[str, Any]:
         """What was spent, and the budget, as plain data."""
-        return {
-            "pulses": self.pulses,
-            "of": self.budget.pulses,
-            "most_on_an_electrode": self.most_on_an_electrode,
-            "of_per_electrode": self.budget.pulses_per_electrode,
-        }
+        budget, most = self.budget, self.most_on_an_electrode
+        of = {"of": budget.pulses, "of_per_electrode": budget.pulses_per_electrode}
+        return {"pulses": self.pulses, "most_on_an_electrode": most, **of}
 
     def __str__(self) -> str:
         of, each = self.budget.pulses, self.budget.pulses_per_electrode
-        return (
-            f"{self.pulses:,}{'' if of is None else f' of {of:,}'} pulses; at most {self.most_on_an_electrode:,}"
-            f"{'' if each is None else f' of {each:,}'} on an electrode"
-        )
+        spent = f"{self.pulses:,}{'' if of is None else f' of {of:,}'} pulses"
+        most = f"{self.most_on_an_electrode:,}{'' if each is None else f' of {each:,}'}"
+        return f"{spent}; at most {most} on an electrode"
 
 
 def record_within(

@@ -37,11 +37,8 @@ class Turns:
     def __enter__(self) -> Guard:
         while not self._lock.acquire(timeout=_LOOK_S):
             if (reason := self.guard.stopped) is not None:
-                raise UnsafeStimulus(
-                    "stopped",
-                    f"an emergency stop is in force ({reason}) and a call from another thread has not returned: "
-                    "close and open again",
-                )
+                waiting = f"an emergency stop is in force ({reason}), and another thread's call has not returned"
+                raise UnsafeStimulus("stopped", f"{waiting}: close and open again")
         if self._is_over or self._is_taken:
             self._lock.release()
             if self._is_over:

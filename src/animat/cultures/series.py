@@ -236,11 +236,8 @@ def _start_s(made: Mapping[int, Path], culture: Culture, protocol: Protocol, int
         if zero_s is None:
             zero_s = 60 * recording.start_min - session * interval_s
         if culture.now_s < 60 * recording.start_min + recording.duration_s:
-            raise _another(
-                file,
-                f"before the culture's clock, which is at {culture.now_s / 60:.2f} min, got one at "
-                f"{recording.start_min:.2f} min: the clock was restarted, or it is another culture",
-            )
+            at = f"{culture.now_s / 60:.2f} min, got one at {recording.start_min:.2f} min"
+            raise _another(file, f"before the culture's clock, which is at {at}: it was restarted, or is another's")
     return culture.now_s if zero_s is None else zero_s
 
 

@@ -68,10 +68,9 @@ def frequency_findings(stimuli: Stimuli, *, has_times: bool = True) -> Iterator[
         return
     stated_hz = np.unique(stimuli.frequency_hz[~np.isnan(stimuli.frequency_hz)])
     if len(stated_hz) > 1 and stated_hz[-1] < 1:
-        message = (
-            f"all frequencies are below 1 Hz, {stated_hz[0]:g} to {stated_hz[-1]:g}: if they are periods in seconds, "
-            f"write 1 divided by each, {1 / stated_hz[-1]:g} to {1 / stated_hz[0]:g}"
-        )
+        periods = f"write 1 divided by each, {1 / stated_hz[-1]:g} to {1 / stated_hz[0]:g}"
+        stated = f"{stated_hz[0]:g} to {stated_hz[-1]:g}"
+        message = f"all frequencies are below 1 Hz, {stated}: if they are periods in seconds, {periods}"
         yield Finding(CONTRADICTED, "warning", message)
 
 

@@ -167,11 +167,10 @@ def select_electrodes(
         passed = passed[_is_best_nearby(array, scan.electrode[passed], ratio[passed], rule.spacing_um)]
     if len(passed) < rule.stimulation_sites:
         best = f"; the best ratio is {ratio.max():.1f}" if len(ratio) else ""
-        raise InvalidArgument(
-            f"stimulation_sites: expected {rule.stimulation_sites} among the recording sites, but only {len(passed)} "
-            f"of {len(scan)} electrodes pass a signal-to-noise ratio of {rule.signal_to_noise:g}{best}: lower the "
-            "ratio or the spacing, scan for longer, or ask for fewer sites"
-        )
+        remedy = "lower the ratio or the spacing, scan for longer, or ask for fewer sites"
+        passing = f"{len(passed)} of {len(scan)} electrodes pass a signal-to-noise ratio of {rule.signal_to_noise:g}"
+        expected = f"{rule.stimulation_sites} among the recording sites"
+        raise InvalidArgument(f"stimulation_sites: expected {expected}, but only {passing}{best}: {remedy}")
     # Ties are broken by electrode number, so that a scan always gives the same selection.
     recording = passed[np.lexsort((scan.electrode[passed], -scan.rate_hz[passed]))][: rule.recording_sites]
     if len(recording) < rule.stimulation_sites:

@@ -93,10 +93,9 @@ class MaxOneCulture(Culture):
         if (array.columns, array.rows) != (220, 120):
             raise InvalidArgument(f"selection: expected one on a MaxOne, got one on a {array.name}")
         if not len(selection.recording) or not 1 <= len(selection.stimulation) <= array.stimulation_units:
-            raise InvalidArgument(
-                f"selection: expected recording sites and 1 to {array.stimulation_units} stimulation sites, got "
-                f"{len(selection.recording)} and {len(selection.stimulation)}"
-            )
+            expected = f"recording sites and 1 to {array.stimulation_units} stimulation sites"
+            got = f"{len(selection.recording)} and {len(selection.stimulation)}"
+            raise InvalidArgument(f"selection: expected {expected}, got {got}")
         if not 0 < sequence_s <= 60:
             raise InvalidArgument(f"sequence_s: expected above 0 to 60 s, got {sequence_s}")
         self.selection = selection

@@ -150,8 +150,6 @@ class ZmqSpikes:
                 # Later messages are from the same server: try this layout first.
                 self._layouts.insert(0, self._layouts.pop(place))
                 return read
-        raise DeviceFailed(
-            f"MaxOne: expected the spikes of frame {number} on amplifiers 0 to {AMPLIFIERS - 1}, of 24 or 16 bytes "
-            f"each, got {len(spikes)} bytes that are neither: this version of MaxLab Live is not known; pass your "
-            "own stream"
-        )
+        expected = f"the spikes of frame {number} on amplifiers 0 to {AMPLIFIERS - 1}, of 24 or 16 bytes each"
+        unknown = "this version of MaxLab Live is not known; pass your own stream"
+        raise DeviceFailed(f"MaxOne: expected {expected}, got {len(spikes)} bytes that are neither: {unknown}")

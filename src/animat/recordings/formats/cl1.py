@@ -112,10 +112,8 @@ def _parameters(file: Hdf5File, stimulus: Column, findings: list[Finding]) -> di
     n_valid = int(np.setdiff1d(np.arange(len(frame)), first).min(initial=len(frame)))
     is_lost = stimulus > frame[:n_valid].max(initial=-1) if n_valid < len(frame) else np.zeros(len(stimulus), bool)
     if lost := int(np.count_nonzero(is_lost)):
-        message = (
-            f"the index of the data stream, written by the SDK, repeats itself after {n_valid:,} of {len(frame):,} "
-            f"entries: frequency and pattern of the last {lost:,} stimuli are not known; animat's own file has them"
-        )
+        where = f"after {n_valid:,} of {len(frame):,} entries: frequency and pattern of the last {lost:,} stimuli"
+        message = f"the SDK's index of the data stream repeats itself {where} are not known; animat's own file has them"
         findings.append(Finding("stimulus-words-lost", "warning", message, float(lost)))
     order = np.argsort(frame[:n_valid], kind="stable")
     texts = [_text(data, int(starts[i]), int(ends[i])) for i in order]

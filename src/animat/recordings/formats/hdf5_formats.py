@@ -110,10 +110,9 @@ def _maxwell(file: Hdf5File, part: str | None, base: Recording) -> RawTraces:
 def _with_gaps(file: Hdf5File, traces: RawTraces, frame: Int64[np.ndarray, " samples"]) -> RawTraces:
     """The traces with NaN for the frames that the rig lost; `frame` is the number of each sample, from 0 on."""
     if len(frame) != traces.samples or np.any(np.diff(frame) <= 0) or frame[-1] > 100 * len(frame):
-        raise InvalidFile(
-            f"{file.path}: expected rising frame_nos or timestamps for {traces.samples:,} samples, got {len(frame):,} "
-            f"up to frame {frame[-1]:,} that do not rise or belong to others: damaged; copy or record it again"
-        )
+        expected = f"expected rising frame_nos or timestamps for {traces.samples:,} samples"
+        got = f"got {len(frame):,} up to frame {frame[-1]:,} that do not rise or belong to others"
+        raise InvalidFile(f"{file.path}: {expected}, {got}: damaged; copy or record it again")
 
     def read_uv(start: int, stop: int) -> Float32[np.ndarray, "samples channels"]:
         first, last = np.searchsorted(frame, [start, stop]).tolist()

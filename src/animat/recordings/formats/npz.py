@@ -39,16 +39,12 @@ def read_npz(path: Path) -> Recording:
             raise InvalidFile(f"{path}: expected a recording, got the state of a virtual culture")
         counts = [key for key in left_out if "spike" in key]
         if counts and "spike_time_s" in missing and "stimulus_time_s" in missing:
-            raise InvalidFile(
-                f"{path}: expected times of spikes and of stimuli (spike_time_s, spike_channel, stimulus_time_s), "
-                f"found only counts ({', '.join(counts[:4])}); provide the times, or counts per stimulus and channel "
-                "as a response table (response_count)"
-            )
-        raise InvalidFile(
-            f"{path}: expected the keys {', '.join(REQUIRED)}; missing {', '.join(missing)}; found "
-            f"{some_of([*columns, *left_out], 12) or 'none'}"
-            + next(filter(None, (did_you_mean(key, missing) for key in left_out)), "")
-        )
+            expected = "times of spikes and of stimuli (spike_time_s, spike_channel, stimulus_time_s)"
+            remedy = "provide the times, or counts per stimulus and channel as a response table (response_count)"
+            raise InvalidFile(f"{path}: expected {expected}, found only counts ({', '.join(counts[:4])}); {remedy}")
+        near = next(filter(None, (did_you_mean(key, missing) for key in left_out)), "")
+        found = f"missing {', '.join(missing)}; found {some_of([*columns, *left_out], 12) or 'none'}{near}"
+        raise InvalidFile(f"{path}: expected the keys {', '.join(REQUIRED)}; {found}")
     provenance = {"source": path.name, "format": "NPZ"}
     if "spike_unit" in keys:
         provenance["channels"] = "sorted units"

@@ -117,11 +117,9 @@ def _long(table: TextTable) -> _Read:
     places = {kind: place for kind in KINDS if (place := table.place((kind,))) is not None}
     trial, channel = table.place((TRIAL, *TABLE_COLUMNS["stimulus_time_s"])), table.place(("channel",))
     if len(places) != 1 or trial is None or channel is None:
-        raise InvalidFile(
-            f"{table.path}, line 1: expected trial (or stimulus_time_s), channel, and count or rate_hz, found "
-            + some_of(table.header, 12)
-            + nearest(table, (TRIAL, *TABLE_COLUMNS["stimulus_time_s"], "channel", *KINDS))
-        )
+        near = nearest(table, (TRIAL, *TABLE_COLUMNS["stimulus_time_s"], "channel", *KINDS))
+        expected = "trial (or stimulus_time_s), channel, and count or rate_hz"
+        raise InvalidFile(f"{table.path}, line 1: expected {expected}, found {some_of(table.header, 12)}{near}")
     ((kind, place),) = places.items()
     numbers = table.numbers(place, kind, required=True)
     _, first, trial_of = np.unique(table.text(trial), return_index=True, return_inverse=True)

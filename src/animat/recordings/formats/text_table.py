@@ -129,10 +129,10 @@ def read_table(path: Path, bare: str | None = None) -> TextTable:
         while len(row) > len(header) and not row[-1].strip():
             row.pop()
         if len(row) != len(header):
-            raise InvalidFile(
-                f"{path}, line {line}: expected {counted(len(header), 'field')}, as in the header, got {len(row)}: "
-                + (_advice(row, separator) if len(row) > len(header) else "is a field missing, or the file cut off?")
-            )
+            missing = "is a field missing, or the file cut off?"
+            advice = _advice(row, separator) if len(row) > len(header) else missing
+            expected = f"{counted(len(header), 'field')}, as in the header"
+            raise InvalidFile(f"{path}, line {line}: expected {expected}, got {len(row)}: {advice}")
     return TextTable(path, header, rows, lines)
 
 
