@@ -19,16 +19,8 @@ from animat.closed_loop.agents import Agent, Controller
 from animat.closed_loop.log import Record
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.runner import runner_of
-from animat.closed_loop.stretch import (
-    Stop,
-    Stretch,
-    check_answer,
-    ending_of,
-    read_response,
-    request_fields,
-    stretch_record,
-)
-from animat.closed_loop.tick import EndedBy, Ending, Handled, Tick
+from animat.closed_loop.stretch import Stretch, check_answer, ending_of, read_response, request_fields, stretch_record
+from animat.closed_loop.tick import EndedBy, Ending, Handled, Stop, Tick
 from animat.closed_loop.timing import Clock
 from animat.coding.encoder import Dealer
 from animat.cultures.base import Culture

@@ -300,7 +300,5 @@ def unanswered_message(session: Session) -> str:
     """A sentence about pulses that were never answered."""
     n = session.outline.unanswered_pulses
     pulses, they = ("1 pulse was", "it was") if n == 1 else (f"{n} pulses were", "they were")
-    return (
-        f"{pulses} requested and never answered: whether {they} delivered is not known; times and electrodes are in "
-        f"{LOG_FILE}"
-    )
+    asked = f"{pulses} requested and never answered: whether {they} delivered is not known"
+    return f"{asked}; times and electrodes are in {LOG_FILE}"

@@ -28,14 +28,6 @@ _MOST_CUT_S = 0.001
 """By how much a response window may be cut: a device may report a pulse a few samples after it was due."""
 
 
-class Stop(Exception):
-    """The session ends before its plan is completed."""
-
-    def __init__(self, ending: Ending) -> None:
-        super().__init__(ending.message)
-        self.ending = ending
-
-
 @dataclass(frozen=True, eq=False)
 class Stretch:
     """What was observed in a stretch of time, numbered from 0; times are on the session's clock, rounded to samples."""

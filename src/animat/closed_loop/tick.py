@@ -90,6 +90,14 @@ class Ending:
     message: str
 
 
+class Stop(Exception):
+    """The session ends before its plan is completed."""
+
+    def __init__(self, ending: Ending) -> None:
+        super().__init__(ending.message)
+        self.ending = ending
+
+
 HEAD = {
     "tick": "number",
     "time_s": "read_after_s",

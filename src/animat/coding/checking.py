@@ -62,10 +62,8 @@ def _check_commands(mapping: Mapping) -> None:
             raise InvalidArgument(f"{expected} {n} commands under jax.jit too, got {shown(same.tolist())}")
         if not np.allclose(same, u, atol=1e-4):
             i = int(np.argmax(np.abs(same - u)))
-            raise InvalidArgument(
-                f"{expected} the same under jax.jit as in numpy{where}, {u[i]:g} for {_RESPONSES_HZ[i]:g} Hz, got "
-                f"{same[i]:g}"
-            )
+            numpys = f"{u[i]:g} for {_RESPONSES_HZ[i]:g} Hz"
+            raise InvalidArgument(f"{expected} the same under jax.jit as in numpy{where}, {numpys}, got {same[i]:g}")
 
 
 def _results(command: Callable[..., Any], x: Any, percentiles: Any, expected: str, hint: str = "") -> Any:

@@ -50,9 +50,7 @@ class Encoder:
                 raise UnusableData(f"condition {condition.label}: expected {needed}, got {given}")
             if condition.electrodes == ():
                 remedy = "train on conditions by frequency or interval"
-                raise UnusableData(
-                    f"{expected} electrodes of its pulses, which a closed loop needs, got none; {remedy}"
-                )
+                raise UnusableData(f"{expected} electrodes of its pulses, as a closed loop needs, got none; {remedy}")
         slowest_hz = min(min(condition.frequencies_hz) for condition in self.conditions)
         if self.pulses > slowest_hz / SLOWEST_HZ:
             take = f"which take {self.pulses / slowest_hz:,.0f} s at {slowest_hz:g} Hz: use fewer"

@@ -66,8 +66,8 @@ def other_channels(recording: Recording, culture: Culture) -> Finding | None:
     different = len(np.setxor1d(recorded, culture.channels.electrode))
     if not different or np.any(recorded == UNKNOWN):
         return None
-    message = f"{different:,} electrodes are read in the recordings or on this culture, but not in both: a response is "
-    message += "the mean over all channels, and percentiles are those of the recordings"
+    what = f"{different:,} electrodes are read in the recordings or on this culture, but not in both"
+    message = f"{what}: a response is the mean over all channels, and percentiles are those of the recordings"
     return Finding("other-channels", "warning", message, float(different))
 
 

@@ -163,10 +163,8 @@ def _restore(culture: VirtualCulture, state: Path) -> int:
         return 0
     recorded = culture.restore_state(state).get("sessions")
     if recorded is None:
-        raise Mismatch(
-            f"{state}: expected the state of a series of recordings, got one after other use (animat live): "
-            "choose another folder"
-        )
+        got = "one after other use (animat live): choose another folder"
+        raise Mismatch(f"{state}: expected the state of a series of recordings, got {got}")
     return recorded
 
 

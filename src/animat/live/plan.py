@@ -27,8 +27,6 @@ from animat.writing import LOCK
 
 LOG_FILE = "live.log"
 RECORDINGS, POLICIES, SESSION = "recordings", "policies", "session"
-EXCHANGE = ".exchange"
-"""A folder through which the training processes receive simulators and report progress."""
 
 
 @record

@@ -20,16 +20,7 @@ from animat.cultures.series import STATE_FILE, order_seed, room_bytes_of
 from animat.cultures.under_way import PartialRecording
 from animat.cultures.virtual import VirtualCulture
 from animat.errors import AnimatError, BudgetSpent, InvalidFile, Mismatch, UnusableData, as_invalid_file, counted
-from animat.live.plan import (
-    EXCHANGE,
-    LOG_FILE,
-    POLICIES,
-    RECORDINGS,
-    SESSION,
-    Timetable,
-    check_plan,
-    for_the_first_recording,
-)
+from animat.live.plan import LOG_FILE, POLICIES, RECORDINGS, SESSION, Timetable, check_plan, for_the_first_recording
 from animat.live.trainers import Trainers
 from animat.neurons.timeline import Kind, SimulatorTimeline, fit_timeline
 from animat.progress import Part, Progress, in_phase
@@ -43,6 +34,8 @@ from animat.training.policy import Policy
 from animat.training.specification import Training
 from animat.writing import exclusive_lock, expect_writable
 
+_EXCHANGE = ".exchange"
+"""A folder through which the training processes receive simulators and report progress."""
 _POLL_S = 0.1
 
 
@@ -196,7 +189,7 @@ class _Run:
         groups = groups_of(self.training, timeline, describe(self.training, timeline))
         minutes, policies = self.timetable.duration_min, self.folder / POLICIES
         progress = in_phase(progress, "training", minutes, "min of the culture")
-        with Trainers(groups, self.folder / EXCHANGE, policies) as trainers:
+        with Trainers(groups, self.folder / _EXCHANGE, policies) as trainers:
             self.write("training", policies=self.training.policies, processes=len(groups))
             try:
                 self._follow(trainers, progress)

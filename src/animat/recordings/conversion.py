@@ -205,10 +205,8 @@ def _with_detected_spikes(
     settings = settings or Detection()
     detected = detect_spikes(traces, base.stimuli.time_s, settings, progress=progress)
     band = "as recorded" if settings.band_hz is None else f"{settings.band_hz[0]:g}-{settings.band_hz[1]:g} Hz"
-    how = (
-        f"{band}, {settings.threshold:g} x median noise, dead time {settings.dead_time_ms:g} ms, blanked "
-        f"{settings.blank_ms[0]:g} ms before to {settings.blank_ms[1]:g} ms after stimuli"
-    )
+    blanked = f"blanked {settings.blank_ms[0]:g} ms before to {settings.blank_ms[1]:g} ms after stimuli"
+    how = f"{band}, {settings.threshold:g} x median noise, dead time {settings.dead_time_ms:g} ms, {blanked}"
     n, stop_s = len(base.stimuli), traces.start_s + traces.samples / traces.sampling_rate_hz
     findings = [*base.findings, *detected.findings]
     if outside := n - np.count_nonzero((base.stimuli.time_s >= traces.start_s) & (base.stimuli.time_s < stop_s)):

@@ -71,20 +71,18 @@ def _stimulus_rows(recording: Recording) -> Iterable[Finding]:
         yield Finding("more-stimuli-than-spikes", "refuse" if ratio >= STIMULI_PER_SPIKE else "note", message, ratio)
     last = recording.stimuli.is_last_of_presentation
     if same := int(np.count_nonzero((np.diff(times_s) == 0) & last[:-1])):
-        message = (
-            f"{same:,} of {len(times_s):,} stimuli come at exactly the same time as the previous one, and the response "
-            "is counted for each: if they are electrodes of one stimulus, put them into one row"
-        )
+        found = f"{same:,} of {len(times_s):,} stimuli come at exactly the same time as the previous one"
+        remedy = "if they are electrodes of one stimulus, put them into one row"
+        message = f"{found}, and the response is counted for each: {remedy}"
         yield Finding("simultaneous-stimuli", "refuse", message, float(same))
 
     frequency_hz, trial = recording.stimuli.frequency_hz, recording.stimuli.presentation
     # Unknown frequencies (NaN) differ from each other too, and do not count.
     differs = ~is_same(frequency_hz[1:], frequency_hz[:-1]) & ~np.isnan(frequency_hz[1:]) & ~np.isnan(frequency_hz[:-1])
     if several := len(np.unique(trial[1:][differs & (np.diff(trial) == 0)])):
-        message = (
-            f"{several:,} of {np.count_nonzero(last):,} trials have pulses of several frequencies, and the response "
-        )
-        message += "counts for that of the last pulse: correct the frequencies or stimulus_presentation"
+        found = f"{several:,} of {np.count_nonzero(last):,} trials have pulses of several frequencies"
+        counts = "the response counts for that of the last pulse: correct the frequencies or stimulus_presentation"
+        message = f"{found}, and {counts}"
         yield Finding("trials-of-several-frequencies", "warning", message, float(several))
 
 

@@ -124,10 +124,8 @@ def _sooner_than_stated(stimuli: Stimuli) -> Iterator[Finding]:
         if periods
         else "correct the frequencies, or group the stimuli by their times (--conditions interval:5,10)"
     )
-    message = (
-        f"stimuli with a stated frequency of {stated_hz:g} Hz are {interval_s:.3g} s apart (median), not "
-        f"{1 / stated_hz:.3g} s: {remedy}"
-    )
+    apart = f"{interval_s:.3g} s apart (median), not {1 / stated_hz:.3g} s"
+    message = f"stimuli with a stated frequency of {stated_hz:g} Hz are {apart}: {remedy}"
     yield Finding(CONTRADICTED, "warning", message, least)
 
 

@@ -60,9 +60,8 @@ def read_places(text: str | os.PathLike[str]) -> Places:
 def read_groups(what: str, names: Sequence[str], path: str | os.PathLike[str]) -> str:
     """The text of a file of groups of electrodes, given in place of one of the `names`; else raises InvalidFile."""
     if is_absent(Path(path)):
-        raise InvalidFile(
-            f"{what}: expected {', '.join(names)} or a file of groups of electrodes, got {path}, which is not a file"
-        )
+        expected = f"{', '.join(names)} or a file of groups of electrodes"
+        raise InvalidFile(f"{what}: expected {expected}, got {path}, which is not a file")
     try:
         return read_plain_text(path, _MOST_BYTES)
     except InvalidFile as error:

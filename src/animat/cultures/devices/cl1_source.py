@@ -111,9 +111,8 @@ class SimulatedCL1:
     ) -> tuple[Int16[np.ndarray, "frames channels"], list[tuple[int, int, Float32[np.ndarray, " samples"]]]]:
         """Frames from `from_frame` on, not read before, and their spikes in order: frame, channel, waveform."""
         if from_frame < self._next:
-            raise InvalidArgument(
-                f"from_frame: expected {self._next} or later: time only moves forward, got {from_frame}"
-            )
+            expected = f"{self._next} or later: time only moves forward"
+            raise InvalidArgument(f"from_frame: expected {expected}, got {from_frame}")
         to_frame = from_frame + frame_count
         self._advance(to_frame)
         # Spikes in skipped frames are dropped.

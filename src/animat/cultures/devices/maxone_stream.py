@@ -94,9 +94,9 @@ class ZmqSpikes:
             if failed is not None or time.monotonic() - self._came_s > PATIENCE_S:
                 got = f"none for {PATIENCE_S:g} s" if failed is None else describe_error(failed)
                 # ZeroMQ does not report a lost connection to a subscriber: it just falls silent.
-                raise DeviceFailed(
-                    f"MaxOne: expected frames from {self._address}, got {got}: is MaxLab Live's server running?"
-                ) from (failed or ConnectionError(f"nothing came for {PATIENCE_S:g} s"))
+                expected = f"MaxOne: expected frames from {self._address}"
+                cause = failed or ConnectionError(f"nothing came for {PATIENCE_S:g} s")
+                raise DeviceFailed(f"{expected}, got {got}: is MaxLab Live's server running?") from cause
             time.sleep(1e-4)
 
     def take(self, start: int, stop: int) -> tuple[Int64[np.ndarray, " spikes"], Int64[np.ndarray, " spikes"]]:

@@ -54,11 +54,8 @@ class Piece:
             rest_uv = rests_uv[nearest, np.arange(len(nearest))]
         cleaned = without_artefacts(rows, self.stimulus, noise_uv, rate_hz, settings, rest_uv)
         is_blank = cleaned.is_blank if self.is_lost is None else cleaned.is_blank | self.is_lost[:, columns].T
-        return replace(
-            cleaned,
-            voltage_uv=np.ascontiguousarray(cleaned.voltage_uv[:, self.lead :]),
-            is_blank=is_blank[:, self.lead :],
-        )
+        voltage_uv = np.ascontiguousarray(cleaned.voltage_uv[:, self.lead :])
+        return replace(cleaned, voltage_uv=voltage_uv, is_blank=is_blank[:, self.lead :])
 
 
 def read_piece(traces: RawTraces, stimulus: Pulses, start: int, stop: int, margin: int) -> Piece:

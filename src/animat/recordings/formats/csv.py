@@ -49,10 +49,8 @@ def read_csv(table: TextTable, stimuli_path: str | os.PathLike[str] | None = Non
     if stimuli is None:
         columns["stimulus_time_s"] = np.empty(0)
         looked_for = " or ".join(file.name for file in _stimuli_beside(path))
-        message = (
-            f"{path.name} has {len(table.rows):,} spikes but no stimuli, so there are no responses to learn from: "
-        )
-        message += f"{looked_for} was looked for; rename the stimulus file accordingly"
+        found = f"{len(table.rows):,} spikes but no stimuli, so there are no responses to learn from"
+        message = f"{path.name} has {found}: {looked_for} was looked for; rename the stimulus file accordingly"
         findings = [*findings, Finding("no-stimuli", "refuse", message)]
     else:
         stimulus_table = read_table(stimuli, "stimulus_time_s")

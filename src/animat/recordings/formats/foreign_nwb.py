@@ -59,11 +59,8 @@ def _units(file: Hdf5File, findings: list[Finding]) -> dict[str, Any]:
     if early := sum(map(count_out_of_order, np.split(time_s, np.cumsum(counts)[:-1]))):
         findings.append(unsorted_finding("spikes", early, len(time_s)))
     order = np.argsort(time_s, kind="stable")
-    columns: dict[str, Any] = {
-        "spike_time_s": time_s[order],
-        "spike_channel": np.repeat(labels, counts)[order],
-        "channel_label": labels,
-    }
+    columns: dict[str, Any] = {"spike_time_s": time_s[order], "channel_label": labels}
+    columns["spike_channel"] = np.repeat(labels, counts)[order]
     row, table = _electrode_of_unit(file, n), _electrodes(file)
     n_electrodes = len(table.get("channel_label", ()))
     if row is None or not n_electrodes:

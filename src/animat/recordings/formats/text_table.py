@@ -181,10 +181,8 @@ def _text(path: Path) -> str:
                 raise InvalidFile(f"{path}: unpacks to over {limit:,} bytes, too many for its size: it is damaged")
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise InvalidFile(
-            f"{path}: expected CSV (text in UTF-8), got something else ({error.reason}); save it as CSV in UTF-8"
-        ) from error
+        why = f"got something else ({error.reason}); save it as CSV in UTF-8"
+        raise InvalidFile(f"{path}: expected CSV (text in UTF-8), {why}") from error
     except (OSError, EOFError, zlib.error) as error:
-        raise InvalidFile(
-            f"{path}: expected a complete file, but it cannot be read or is cut off ({error}); copy it again"
-        ) from error
+        why = f"it cannot be read or is cut off ({error}); copy it again"
+        raise InvalidFile(f"{path}: expected a complete file, but {why}") from error
