@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
-from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Any, NotRequired
 
@@ -14,6 +13,7 @@ from pydantic import AfterValidator, Field, Strict
 from typing_extensions import TypedDict
 
 from animat.errors import AnimatError, InvalidArgument, InvalidFile, shown
+from animat.recordings.metadata import date_of
 from animat.recordings.recording import Channels
 from animat.records import Number, Whole, read_record
 from animat.responses.readouts import Readouts
@@ -32,10 +32,8 @@ def _hdf5_text(value: str) -> str:
 
 
 def _date(value: str) -> str:
-    try:
-        datetime.fromisoformat(value)
-    except ValueError:
-        raise ValueError(f"expected a date in ISO 8601, got {shown(value)}") from None
+    if date_of({"recorded_at": value}) is None:
+        raise ValueError(f"expected a date in ISO 8601, got {shown(value)}")
     return value
 
 

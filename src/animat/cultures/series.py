@@ -256,7 +256,6 @@ def _another(file: Path, difference: str) -> Mismatch:
 
 
 def _parsed(text: str) -> Any:
-    try:
+    with suppress(ValueError, RecursionError):
         return json.loads(text)
-    except (ValueError, RecursionError):
-        return text
+    return text

@@ -149,9 +149,6 @@ def select_electrodes(
     `spacing_um`, those with the highest rate. Stimulation sites: of the recording sites, those with the highest
     product of spike amplitude and excitatory score, since stimulation is most reliable where the spike is largest.
 
-    Args:
-        seed: of the patterns' draw.
-
     Raises:
         InvalidArgument: for criteria that cannot be met, with what to relax.
 

@@ -51,6 +51,8 @@ CL1_LIMITS = Limits(
 CL1_PULSE = Pulse((Phase(160.0, amplitude_ua=-1.0), Phase(160.0, amplitude_ua=1.0)))
 """Balanced, cathodic first, 0.16 nC per phase: the SDK's default pulse for a current of 1 uA."""
 
+_GRID = ElectrodeArray("CL1", columns=8, rows=8, pitch_um=1.0, channels=CHANNELS, stimulation_units=len(SITES))
+"""Channels are numbered down the columns; distances are the same as along the rows."""
 Patterns = Sequence[Sequence[int]] | Int64[np.ndarray, "patterns size"]
 
 
@@ -103,7 +105,8 @@ class CL1Culture(Culture):
             raise InvalidArgument(f"margin_ms: expected 0 to 1000 ms, got {margin_ms}")
         if jitter_tolerance_ms is not None and not jitter_tolerance_ms >= 0:
             raise InvalidArgument(f"jitter_tolerance_ms: expected 0 ms or more, or None, got {jitter_tolerance_ms}")
-        self._patterns = _check_patterns(_draw_patterns(seed) if patterns is None else patterns)
+        drawn = draw_patterns(_GRID, np.array(SITES), seed=seed, spacing_um=1.0) if patterns is None else patterns
+        self._patterns = _check_patterns(drawn)
         self._seed = seed if patterns is None else None
         self._ticks_per_s, self._margin_frames = ticks_per_s, round(margin_ms * 1e-3 * FRAMES_PER_S)
         tolerance = None if jitter_tolerance_ms is None else round(jitter_tolerance_ms * 1e-3 * FRAMES_PER_S)
@@ -265,10 +268,3 @@ def _check_patterns(patterns: Patterns) -> Int64[np.ndarray, "patterns size"]:
     table = padded(rows)
     table.setflags(write=False)
     return table
-
-
-def _draw_patterns(seed: int) -> Int64[np.ndarray, "patterns size"]:
-    """100 patterns of five channels, no two of which are neighbours in a row or column."""
-    # Channels are numbered down the columns; distances are the same as along the rows.
-    grid = ElectrodeArray("CL1", columns=8, rows=8, pitch_um=1.0, channels=CHANNELS, stimulation_units=len(SITES))
-    return draw_patterns(grid, np.array(SITES), seed=seed, spacing_um=1.0)
