@@ -332,15 +332,9 @@ class Driver:
             self._log_fault(ending, request, is_admitted=bool(stimuli), got=repr(observed)[:2000])
             raise Stop(ending)
         offset_s = observed.start_s - self._zero_s
-        stretch = Stretch(
-            number,
-            offset_s,
-            observed.duration_s,
-            self._on_samples(offset_s + observed.spikes.time_s),
-            np.asarray(observed.spikes.channel, np.int64),
-            self._channels,
-            self._on_samples(offset_s + observed.stimulus_time_s),
-        )
+        times_s, pulses_s = (self._on_samples(offset_s + t) for t in (observed.spikes.time_s, observed.stimulus_time_s))
+        channel = np.asarray(observed.spikes.channel, np.int64)
+        stretch = Stretch(number, offset_s, observed.duration_s, times_s, channel, self._channels, pulses_s)
         self._observed_until_s = offset_s + observed.duration_s
         if pause:
             self.records.append(stretch_record(stretch, (), None))

@@ -357,7 +357,8 @@ def check_session(culture: Culture, loop: Loop, agents: Sequence[Agent], episode
         raise InvalidArgument(f"patterns: expected at most the culture's {len(culture.patterns)}, got {loop.patterns}")
     seeing = [agent.name for agent, n in zip(agents, episodes, strict=True) if any(map(agent.sees_neurons, range(n)))]
     if seeing and loop.remembering is None:
-        raise InvalidArgument(f"loop: expected `remembering`, as {', '.join(seeing)} sees the history state, got none")
+        why = f"for agents that see the history state ({', '.join(seeing)})"
+        raise InvalidArgument(f"loop: expected `remembering` of a recording {why}, got none")
     loop.readouts.members(culture.channels)
     culture.limits.check_pulse(loop.pulse)
     if unknown := sorted({*loop.encoder.electrodes} - {*culture.stimulation_electrodes}):

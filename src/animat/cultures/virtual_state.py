@@ -14,6 +14,7 @@ from jaxtyping import Int64
 
 from animat.cultures.tissue import Tissue
 from animat.cultures.tissue.coupling import Kicks
+from animat.cultures.tissue.kernel import State
 from animat.cultures.tissue.snapshot import LONGEST_NS, Snapshot, expect_array, expect_rising, expect_whole
 from animat.errors import InvalidArgument, InvalidFile, Mismatch, shown
 from animat.stimulation.array import MAXONE
@@ -72,14 +73,10 @@ def read_state(path: Path, settings: Mapping[str, str], tissue: Tissue) -> Virtu
                 if name == "tissue_revision":
                     remedy = "continue with the version of animat that wrote it, or start again in another folder"
                 raise Mismatch(f"{path}: expected the state of this culture, got one which differs in {name}: {remedy}")
-        snapshot = Snapshot(
-            seed=tissue.seed,
-            parameters=tissue.parameters,
-            now_ns=head["tissue_now_ns"],
-            step=head["tissue_step"],
-            kicks=Kicks(*(arrays[f"kicks_{name}"] for name in Kicks._fields)),
-            state=fresh.state._replace(**{name: arrays[f"state_{name}"] for name in fresh.state._fields}),
-        )
+        kicks = Kicks(*(arrays[f"kicks_{name}"] for name in Kicks._fields))
+        saved = State(*(arrays[f"state_{name}"] for name in State._fields))
+        clock = head["tissue_now_ns"], head["tissue_step"]
+        snapshot = Snapshot(tissue.seed, tissue.parameters, *clock, kicks, saved)
         # First, because the other clocks are checked against the tissue's.
         tissue.restore(snapshot)
         zero_ns, now_ns, remarks = head["zero_ns"], head["now_ns"], head["remarks"]

@@ -294,9 +294,10 @@ class _Run:
         # Its last known time if the connection is lost.
         with suppress(Exception):
             self._known_s = self.culture.now_s
+        at, wall_s = datetime.now(UTC).isoformat(timespec="milliseconds"), time.monotonic() - self._wall_zero_s
         line = {
-            "at": datetime.now(UTC).isoformat(timespec="milliseconds"),
-            "wall_s": round(time.monotonic() - self._wall_zero_s, 3),
+            "at": at,
+            "wall_s": round(wall_s, 3),
             "culture_min": round(self._known_s / 60, 4),
             "what": what,
             **fields,

@@ -154,14 +154,9 @@ class PlainColumns:
             (_, *listed), number = np.unique(np.append("", pattern), return_inverse=True)
             pattern = number[1:] + UNKNOWN
             names["patterns"] = ", ".join(f"{i}: {name}" for i, name in enumerate(listed))
-        stimuli = Stimuli(
-            time_s=time_s,
-            frequency_hz=frequency_hz[in_time],
-            pattern=pattern[in_time],
-            electrodes=self._electrodes(n)[in_time],
-            presentation=self._presentations(n, in_time, noted),
-        )
-        return stimuli, names
+        electrodes = self._electrodes(n)[in_time]
+        presentation = self._presentations(n, in_time, noted)
+        return Stimuli(time_s, frequency_hz[in_time], pattern[in_time], electrodes, presentation), names
 
     def _electrodes(self, n: int) -> Int64[np.ndarray, "stimuli electrodes"]:
         given = np.full(n, UNKNOWN) if self.stimulus_electrodes is None else np.asarray(self.stimulus_electrodes)

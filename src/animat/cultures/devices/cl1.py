@@ -247,11 +247,9 @@ def _remedy(error: Exception, session: Session) -> str:
 
 
 def _sdk() -> ModuleType:
-    return vendor_module(
-        "cl",
-        "culture: expected the vendor's package cl-sdk for a cl1, which is not installed: on Python 3.12 or later "
-        f"{install_command('cl1')} (its licence is CC BY-NC 4.0); on a CL1 it is preinstalled",
-    )
+    missing = "culture: expected the vendor's package cl-sdk for a cl1, which is not installed"
+    how = f"on Python 3.12 or later {install_command('cl1')} (its licence is CC BY-NC 4.0); on a CL1 it is preinstalled"
+    return vendor_module("cl", f"{missing}: {how}")
 
 
 def _check_patterns(patterns: Patterns) -> Int64[np.ndarray, "patterns size"]:

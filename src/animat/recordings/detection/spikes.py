@@ -105,12 +105,8 @@ def detect_spikes(
             progress.update(done, len(starts), f"{sum(map(len, samples)):,} spikes")
     sample, channel = np.concatenate(samples), np.concatenate(channels)
     order = np.lexsort((channel, sample))
-    return DetectedSpikes(
-        time_s=traces.start_s + sample[order] / rate_hz,
-        channel=channel[order],
-        noise_uv=noise_uv,
-        findings=(*_lost(lost, traces.samples), *_findings(noise_uv, len(stimulus), saturations, settings)),
-    )
+    findings = *_lost(lost, traces.samples), *_findings(noise_uv, len(stimulus), saturations, settings)
+    return DetectedSpikes(traces.start_s + sample[order] / rate_hz, channel[order], noise_uv, findings)
 
 
 def is_dead(noise_uv: Levels) -> np.ndarray:

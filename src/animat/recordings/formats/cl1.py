@@ -65,15 +65,9 @@ def read_cl1(file: Hdf5File, *, spikes: bool = True) -> Recording:
         text = file.attribute("/", name)
         if isinstance(text, str) and text and text.isprintable() and text != STAND_IN:
             provenance[key] = text
-    return PlainColumns(
-        spike_time_s=spike_time_s,
-        spike_channel=channel[on_electrode],
-        stimulus_time_s=stimulus_time_s,
-        channel_label=electrodes,
-        channel_electrode=electrodes,
-        sampling_rate_hz=rate_hz,
-        **columns,
-    ).to_recording(provenance, tuple(findings))
+    columns |= {"channel_label": electrodes, "channel_electrode": electrodes, "sampling_rate_hz": rate_hz}
+    plain = PlainColumns(spike_time_s, channel[on_electrode], stimulus_time_s, **columns)
+    return plain.to_recording(provenance, tuple(findings))
 
 
 def _first_frame(file: Hdf5File, spike: Column, stimulus: Column) -> int:

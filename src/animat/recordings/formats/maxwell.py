@@ -90,13 +90,9 @@ def read_maxwell(
     stimulus_time_s = (stimulus_frame.astype(np.int64) - first_frame) / rate_hz
     if layout.frames is not None:
         columns |= recorded_span(layout.frames, rate_hz, spike_time_s, stimulus_time_s)
-    return PlainColumns(
-        spike_time_s=spike_time_s,
-        spike_channel=spike_channel[routed],
-        stimulus_time_s=stimulus_time_s,
-        sampling_rate_hz=rate_hz,
-        **columns,
-    ).to_recording({"source": file.path.name, "format": "MaxWell", **layout.provenance}, tuple(findings))
+    plain = PlainColumns(spike_time_s, spike_channel[routed], stimulus_time_s, sampling_rate_hz=rate_hz, **columns)
+    provenance = {"source": file.path.name, "format": "MaxWell", **layout.provenance}
+    return plain.to_recording(provenance, tuple(findings))
 
 
 def _new(file: Hdf5File, part: str | None) -> _Layout:

@@ -52,14 +52,9 @@ def open_with_spikeinterface(
     pulses = Path(stimuli_path) if stimuli_path is not None else stimuli_beside(path.with_name(f"{path.stem}.csv"))
     columns: dict[str, Any] = {"stimulus_time_s": np.empty(0)} if pulses is None else read_stimuli_csv(pulses)
     columns |= recorded_span(samples, rate_hz, columns["stimulus_time_s"])
-    base = PlainColumns(
-        spike_time_s=np.empty(0),
-        spike_channel=np.empty(0, np.int64),
-        channel_label=labels,
-        channel_xy_um=xy_um,
-        sampling_rate_hz=rate_hz,
-        **columns,
-    ).to_recording({"source": path.name, "format": f"{reader}, by SpikeInterface"})
+    columns |= {"channel_label": labels, "channel_xy_um": xy_um, "sampling_rate_hz": rate_hz}
+    plain = PlainColumns(np.empty(0), np.empty(0, np.int64), **columns)
+    base = plain.to_recording({"source": path.name, "format": f"{reader}, by SpikeInterface"})
     get_traces = partial(recording.get_traces, segment_index=0, return_in_uV=recording.has_scaleable_traces())
 
     def read_uv(start: int, stop: int) -> Float32[np.ndarray, "samples channels"]:
