@@ -51,8 +51,8 @@ class Hdf5File:
             if link is None:
                 return None
             if isinstance(link, h5py.ExternalLink):
-                link = f"{where} is a link to another file, which is never followed"
-                raise InvalidFile(f"{self.path}: expected data in the file itself, but {link}: copy all into one")
+                link = f"{where} is a link to another file, which is never followed; copy all data into one file"
+                raise InvalidFile(f"{self.path}: expected data in the file itself, but {link}")
             if isinstance(link, h5py.SoftLink):
                 hops += 1
                 if hops > SOFT_LINKS:
