@@ -32,17 +32,13 @@ def other_culture(recording: Recording, culture: Culture) -> Finding | None:
     if differ:
         message = f"the recordings are {differ[0]}, but this is {differ[1]}: percentiles differ between cultures"
     elif isinstance(culture, VirtualCulture) and now_min < start_min:
-        message = (
-            f"the culture starts{' afresh' if now_min == 0 else ''} at {now_min:.0f} min, but its percentiles are of "
-            f"the recording at {start_min:.0f} min, and they change over time: pass its state after that recording "
-            "(--state)"
-        )
+        at = f"{' afresh' if now_min == 0 else ''} at {now_min:.0f} min"
+        of = f"its percentiles are of the recording at {start_min:.0f} min, and they change over time"
+        message = f"the culture starts{at}, but {of}: pass its state after that recording (--state)"
     elif culture.name == "cl1" and now_min < stop_min:
-        message = (
-            f"the CL1's clock is at {now_min:.1f} min, before the end of the recording at {start_min:.1f} min that "
-            "percentiles are taken from: the device was restarted, as the SDK's simulator is whenever it is opened, "
-            "and a simulated culture with it; percentiles change over time"
-        )
+        before = f"before the end of the recording at {start_min:.1f} min that percentiles are taken from"
+        why = "the device was restarted, as the SDK's simulator is whenever it is opened; percentiles change over time"
+        message = f"the CL1's clock is at {now_min:.1f} min, {before}: {why}"
     else:
         return None
     return Finding("other-culture", "warning", message, stop_min - now_min if stop_min > now_min else None)

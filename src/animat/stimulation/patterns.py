@@ -55,9 +55,8 @@ def draw_patterns(
                 if len(drawn) == patterns:
                     break
     if len(drawn) < patterns:
-        raise InvalidArgument(
-            f"patterns: expected {patterns} different sets of {size} electrodes with every pair more than "
-            f"{spacing_um:g} um apart, but random draws among {len(electrodes)} electrodes found only {len(drawn)}: "
-            "ask for fewer patterns, fewer electrodes in each, a shorter distance, or more stimulation sites"
-        )
+        expected = f"{patterns} different sets of {size} electrodes with every pair more than {spacing_um:g} um apart"
+        found = f"random draws among {len(electrodes)} electrodes found only {len(drawn)}"
+        remedy = "ask for fewer patterns, fewer electrodes in each, a shorter distance, or more stimulation sites"
+        raise InvalidArgument(f"patterns: expected {expected}, but {found}: {remedy}")
     return electrodes[np.array(list(drawn), dtype=np.int64).reshape(patterns, size)]

@@ -284,11 +284,9 @@ def _findings(noise_uv: Levels, n_stimuli: int, saturation: np.ndarray, settings
     if len(saturation) and saturation[:, 0].any():
         mean, longest = float(saturation[:, 0].mean()), float(np.median(saturation[saturation[:, 0] > 0, 1]))
         share = mean / max(n, 1)
-        message = (
-            f"after a stimulus {mean:.1f} of {n:,} channels are saturated on average, the longest until "
-            f"{longest:.1f} ms (median of {np.count_nonzero(saturation[:, 0]):,} stimuli; at most "
-            f"{saturation[:, 1].max():.1f} ms); they are blanked until then"
-        )
+        of = f"median of {np.count_nonzero(saturation[:, 0]):,} stimuli; at most {saturation[:, 1].max():.1f} ms"
+        message = f"after a stimulus {mean:.1f} of {n:,} channels are saturated on average, the longest until "
+        message += f"{longest:.1f} ms ({of}); they are blanked until then"
         is_much = share >= 0.05 and longest > 2
         message += ": rates in an earlier window are too low; use a window that begins later" if is_much else ""
         yield Finding("saturated-channels", "warning" if is_much else "note", message, share)
