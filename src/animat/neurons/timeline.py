@@ -162,10 +162,9 @@ def fit_timeline(
         Mismatch: if the recordings differ in conditions, window, presentation or readouts, or two share a minute.
         UnusableData: if a condition of a recording has no non-burst response.
     """
-    series = tuple(series)
-    if not series:
-        raise InvalidArgument("series: expected the responses of at least one recording, got none")
     ordered = sorted(series, key=lambda responses: responses.start_min)
+    if not ordered:
+        raise InvalidArgument("series: expected the responses of at least one recording, got none")
     first = ordered[0]
     kind = kind or default_kind(first)
     if mismatch := series_mismatch(ordered):
