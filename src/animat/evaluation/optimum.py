@@ -160,10 +160,8 @@ def best_returns(
     layers = max(1 if memory_of(*case) is None else CLASSES for case in cases)
     kept_mib = 2 * fine.size * layers * robot.episode_limit / 2**20
     if episodes and kept_mib > _MOST_MIB:
-        raise InvalidArgument(
-            f"resolution: expected a grid whose tables fit into {_MOST_MIB / 1024:g} GiB, got {resolution:g}, which "
-            f"takes {kept_mib / 1024:.3g} GiB ({robot.episode_limit:,} iterations per episode): use a smaller one"
-        )
+        most, took = f"{_MOST_MIB / 1024:g} GiB", f"{resolution:g}, which takes {kept_mib / 1024:.3g} GiB"
+        raise InvalidArgument(f"resolution: expected tables that fit into {most}, got {took}: use a smaller one")
     at_once = max(1, int(_TABLES_AT_ONCE_MIB / kept_mib))
     optima: list[Optimum] = []
     for start in range(0, len(cases), at_once):

@@ -169,10 +169,8 @@ def check_at_once(name: str, episodes: int, n_actors: int) -> None:
     """Refuse fewer than one episode, or more than fit side by side (InvalidArgument, with the argument's name)."""
     expect_at_least(name, episodes, 1)
     if episodes * n_actors > MOST_AT_ONCE:
-        raise InvalidArgument(
-            f"{name}: expected at most {MOST_AT_ONCE // n_actors:,} each, as {n_actors} run side by side, got "
-            f"{shown(episodes)}"
-        )
+        most = f"{MOST_AT_ONCE // n_actors:,} each, as {n_actors} run side by side"
+        raise InvalidArgument(f"{name}: expected at most {most}, got {shown(episodes)}")
 
 
 def networks_of(policies: Sequence[Policy], *, greedy: bool = False) -> Networks:

@@ -174,9 +174,7 @@ def normalised_score(policy: float, random: float, optimum: float) -> float:
     Raises InvalidArgument if the optimum is not above the random policy: nothing can be learned.
     """
     if not optimum > random:
-        raise InvalidArgument(
-            f"optimum: expected more than the random policy's {random:g}, got {optimum:g}: no controller is better"
-        )
+        raise InvalidArgument(f"optimum: expected more than the random policy's {random:g}, got {optimum:g}")
     return (policy - random) / (optimum - random)
 
 

@@ -353,8 +353,6 @@ def _by_condition(responses: Responses) -> list[Float64[np.ndarray, "responses *
     values = [responses.read_hz[kept[responses.condition[kept] == c]] for c in range(len(responses.conditions))]
     for condition, x in zip(responses.conditions, values, strict=True):
         if not len(x):
-            raise UnusableData(
-                f"condition {condition.label}: expected non-burst responses to fit, got none, which --allow cannot "
-                "change: leave the condition out, or choose others (--conditions)"
-            )
+            got = "none, which --allow cannot change: leave it out, or choose others (--conditions)"
+            raise UnusableData(f"condition {condition.label}: expected non-burst responses to fit, got {got}")
     return values

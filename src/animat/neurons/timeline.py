@@ -111,10 +111,8 @@ class SimulatorTimeline:
     def requested_row(self, minute: float) -> int:
         """The same for a minute that a user gave; raises InvalidArgument for one before the first recording, or NaN."""
         if not minute >= self.start_min[0]:
-            raise InvalidArgument(
-                f"at_min: expected a minute on the culture's clock from the first recording on, which started at "
-                f"{self.start_min[0]:g} min, got {minute:g}"
-            )
+            first = f"the first recording on, which started at {self.start_min[0]:g} min"
+            raise InvalidArgument(f"at_min: expected a minute on the culture's clock from {first}, got {minute:g}")
         return self.row_at(minute)
 
     def at(self, minute: float) -> NeuronSimulator:

@@ -169,10 +169,8 @@ class Cartpole(Robot[CartpoleState]):
         a large angle limit there is none (InvalidArgument).
         """
         if self.angle_limit_rad > 0.75:
-            raise InvalidArgument(
-                f"angle_limit_rad: expected at most 0.75 for the cartpole's own grid, got {self.angle_limit_rad:g}; "
-                "pass a Grid"
-            )
+            most = "0.75 without a grid of your own"
+            raise InvalidArgument(f"angle_limit_rad: expected at most {most}, got {self.angle_limit_rad:g}")
         half_length_m = self.pole_length_m / 2
         total_kg = self.cart_mass_kg + self.pole_mass_kg
         shear_m = 4 / 3 * half_length_m

@@ -68,14 +68,11 @@ class Shuttle(Robot[ShuttleState]):
 
     def __post_init__(self) -> None:
         if self.place_radius_m >= self.place_m:
-            raise InvalidArgument(
-                f"place_radius_m: expected less than {self.place_m:g}, so that the places do not overlap, got "
-                f"{self.place_radius_m:g}"
-            )
+            most = f"{self.place_m:g}, so that the places do not overlap"
+            raise InvalidArgument(f"place_radius_m: expected less than {most}, got {self.place_radius_m:g}")
         if self.place_m > self.track_length_m / 2:
-            raise InvalidArgument(
-                f"place_m: expected at most {self.track_length_m / 2:g}, where the track ends, got {self.place_m:g}"
-            )
+            most = f"{self.track_length_m / 2:g}, where the track ends"
+            raise InvalidArgument(f"place_m: expected at most {most}, got {self.place_m:g}")
 
     @property
     def return_range(self) -> tuple[float, float]:

@@ -80,9 +80,8 @@ def rows_of(training: Training, timeline: SimulatorTimeline | None) -> list[tupl
         drawn = np.flatnonzero((timeline.start_min >= low) & (timeline.start_min <= min(high, until_min)))
         if not len(drawn):
             known = ", ".join(f"{minute:g}" for minute in timeline.start_min if minute <= until_min)
-            raise InvalidArgument(
-                f"lesson {number}: recordings_min: expected minutes with a recording ({known}), got [{low:g}, {high:g}]"
-            )
+            expected = f"minutes with a recording ({known})"
+            raise InvalidArgument(f"lesson {number}: recordings_min: expected {expected}, got [{low:g}, {high:g}]")
         rows.append((int(drawn[0]), int(drawn[-1])))
     return rows
 
