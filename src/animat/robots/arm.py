@@ -206,9 +206,8 @@ class TwoLinkArm(Robot[ArmState]):
         """The distance from tip to target over time in each episode."""
         distances_m, radius_m = [np.hypot(path[:, 8], path[:, 9]) for path in paths], self.target_radius_m
         arrived = [bool(distance_m[-1] <= radius_m) for distance_m in distances_m]
-        success, ylabel = "end at the target", "tip to target (m)"
-        draw_over_time(axes, self, distances_m, arrived, limits=[radius_m], success=success, ylabel=ylabel)
-        axes.set_ylim(bottom=0)
+        draw_over_time(axes, self, distances_m, arrived, limits=[radius_m], success="end at the target")
+        axes.set(ylabel="tip to target (m)", ylim=(0, None))
 
     def _to_target(self, state: ArmState) -> tuple[Array, Array]:
         both = state.shoulder_rad + state.elbow_rad

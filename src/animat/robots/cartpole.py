@@ -235,8 +235,8 @@ class Cartpole(Robot[CartpoleState]):
         """The pole's angle over time in each episode."""
         limit_deg, angles_deg = math.degrees(self.angle_limit_rad), [np.degrees(path[:, 2]) for path in paths]
         stayed, limits = [len(path) > self.episode_limit for path in paths], (-limit_deg, limit_deg)
-        draw_over_time(axes, self, angles_deg, stayed, limits=limits, success="to the end", ylabel="pole angle (deg)")
-        axes.set_ylim(-1.25 * limit_deg, 1.25 * limit_deg)
+        draw_over_time(axes, self, angles_deg, stayed, limits=limits, success="to the end")
+        axes.set(ylabel="pole angle (deg)", ylim=(-1.25 * limit_deg, 1.25 * limit_deg))
 
     def _bounds(self) -> tuple[tuple[float, float], tuple[float, float]]:
         """Bounds of (position, velocity) of the cart and of the pole over whole episodes that start at rest.

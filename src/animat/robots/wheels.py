@@ -205,9 +205,8 @@ class Wheels(Robot[WheelsState]):
         """The distance to the goal over time in each episode."""
         distances_m, radius_m = [path[:, 8] for path in paths], self.goal_radius_m
         arrived = [bool(distance_m[-1] <= radius_m) for distance_m in distances_m]
-        ylabel = "distance to the goal (m)"
-        draw_over_time(axes, self, distances_m, arrived, limits=[radius_m], success="arrived", ylabel=ylabel)
-        axes.set_ylim(bottom=0)
+        draw_over_time(axes, self, distances_m, arrived, limits=[radius_m], success="arrived")
+        axes.set(ylabel="distance to the goal (m)", ylim=(0, None))
 
     @property
     def _around(self) -> Surroundings:

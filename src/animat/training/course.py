@@ -141,7 +141,8 @@ class Course:
         if not training.episodes_assessed:
             return
         minute = self._minute(index)
-        if index and self._row(minute) != self._row(self._minute(index - 1)):
+        timeline = self._timeline
+        if timeline and index and timeline.row_at(minute) != timeline.row_at(self._minute(index - 1)):
             # A culture is easier to control at some minutes than at others: compare on the simulator now in use.
             score = self._scores(best, simulator)
         new_score = self._scores(deployed, simulator)
@@ -176,9 +177,6 @@ class Course:
         if self._timeline is None or self._training.shadowing == "drawn":
             return np.nan
         return float(self._timeline.start_min[0]) + self._training.minute(index)
-
-    def _row(self, minute: float) -> int:
-        return 0 if self._timeline is None or np.isnan(minute) else self._timeline.row_at(minute)
 
     def note(self) -> str:
         """The lesson of each policy, for the progress line; empty if there is only one."""
