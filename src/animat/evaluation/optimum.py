@@ -78,10 +78,9 @@ class Optimum:
             text += f", {100 * interval.confidence:g} % interval {interval.low:.1f} to {interval.high:.1f}"
         text += f" (grid {self.grid_error:.1f})"
         if self.episodes:
-            text += (
-                f"; its controller, run: {self.monte_carlo:.1f} +- {self.standard_error:.1f}, without knowing the time "
-                f"left {self.without_clock:.1f} +- {self.without_clock_standard_error:.1f}"
-            )
+            known = f"{self.monte_carlo:.1f} +- {self.standard_error:.1f}"
+            unknown = f"{self.without_clock:.1f} +- {self.without_clock_standard_error:.1f}"
+            text += f"; its controller, run: {known}, without knowing the time left {unknown}"
         if self.left_out:
             text += f"; too few responses to count: {', '.join(self.left_out)}"
         return text
@@ -196,10 +195,8 @@ def _expect_known(environment: Environment[Any]) -> None:
         inmost = inmost.inside
     kind, kinds = type(inmost), (Animat, WithoutNeurons)
     if (kind.respond, kind.advance) not in [(known.respond, known.advance) for known in kinds]:
-        raise InvalidArgument(
-            "environment: expected an Animat or WithoutNeurons, with a limit, neural observation, shuffled delivery or "
-            f"trial costs at most, got {kind.__name__}, whose optimal return is not known"
-        )
+        got = f"{kind.__name__}, whose optimal return is not known"
+        raise InvalidArgument(f"environment: expected an Animat or WithoutNeurons, in wrappers of animat, got {got}")
 
 
 # At module level, so that it is compiled once, with the clock and without.

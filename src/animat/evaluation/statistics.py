@@ -307,11 +307,9 @@ class Verdict:
             parts.append(f"the policies do not outperform these controls: {', '.join(not_outperformed)}")
         if few:
             fewest = min(few.values(), key=lambda each: each.control)
-            parts.append(
-                f"{counted(fewest.policies, 'episode')} of the policies and "
-                f"{fewest.control} of a control are too few to show (p < {OUTPERFORMED_P:g}) whether the policies "
-                f"outperform {', '.join(few)}"
-            )
+            episodes = f"{counted(fewest.policies, 'episode')} of the policies and {fewest.control} of a control"
+            whether = f"(p < {OUTPERFORMED_P:g}) whether the policies outperform {', '.join(few)}"
+            parts.append(f"{episodes} are too few to show {whether}")
         if not parts:
             least = min(each.wins for each in self.controls.values())
             parts.append(

@@ -241,10 +241,9 @@ def load_timeline(path: Path) -> SimulatorTimeline:
         )
     except (OSError, ValueError, KeyError, TypeError, SafetensorError, AnimatError) as error:
         reason = f"no entry {error}" if isinstance(error, KeyError) else error
-        raise InvalidFile(
-            f"{path}: expected simulators as animat study and animat tune write them, got a file that cannot be read "
-            f"as such: {reason}; run the command again to replace it"
-        ) from error
+        expected = "simulators as animat study and animat tune write them"
+        got = f"another file ({reason}); run the command again to replace it"
+        raise InvalidFile(f"{path}: expected {expected}, got {got}") from error
 
 
 def fit_simulator(

@@ -108,10 +108,8 @@ def _check_compiled(robot: Robot[Any]) -> None:
             within = np.clip(number, quantity.low, quantity.high)
             # Up to rounding in float32.
             if not np.isclose(number, within, rtol=1e-5, atol=1e-5 * quantity.scale):
-                raise InvalidArgument(
-                    f"{name}.observe: {quantity.name}: expected from {quantity.low:g} to {quantity.high:g}, the bounds "
-                    f"of its Quantity, got {number:g}"
-                )
+                bounds = f"from {quantity.low:g} to {quantity.high:g}, the bounds of its Quantity"
+                raise InvalidArgument(f"{name}.observe: {quantity.name}: expected {bounds}, got {number:g}")
 
 
 def _expect_grid(what: str, value_grid: Callable[[], Any]) -> None:

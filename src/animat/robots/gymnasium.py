@@ -167,9 +167,8 @@ def _inspected(id: str, episode_limit: int | None, settings: tuple[tuple[str, fl
         body = _Environment(id, settings)
     limit = body.limit if episode_limit is None else episode_limit
     if limit is None:
-        raise InvalidArgument(
-            f"{FAMILY}:{id}: expected an episode limit, got an environment without one: --parameters episode_limit=1000"
-        )
+        got = "an environment without one: --parameters episode_limit=1000"
+        raise InvalidArgument(f"{FAMILY}:{id}: expected an episode limit, got {got}")
     robot = GymnasiumRobot(id, settings, limit, body.low, body.high, body.levels, (1.0,) * body.observed, False)
     return replace(robot, scales=measured_scales(robot, body.bounds), keeps_state=is_repeatable(robot))
 

@@ -103,9 +103,8 @@ def _expect_lesson(lesson: Lesson, robot: Robot[Any], draws_recordings: bool) ->
         got = f"{robot.name}, which has no method `succeeded`; use until_return"
         raise InvalidArgument(f"success: expected a robot that reports success, got {got}")
     if lesson.recordings_min is not None and not draws_recordings:
-        raise InvalidArgument(
-            "recordings_min: expected only with shadowing 'drawn' (--shadowing drawn), got it without"
-        )
+        expected = "only with shadowing 'drawn' (--shadowing drawn)"
+        raise InvalidArgument(f"recordings_min: expected {expected}, got it without")
     body: Any = without_goal(robot)
     numbers = {f.name: getattr(body, f.name) for f in dataclasses.fields(body)}
     if len(lesson.parameters) > MOST_VARIED:

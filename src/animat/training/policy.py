@@ -321,9 +321,8 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray[Any, Any]], dict[str, Any]]:
             kinds = {name: file.get_slice(name).get_dtype() for name in file.keys()}  # noqa: SIM118
             if set(kinds) - {"assessments"} != set(_ARRAYS) or not set(kinds.values()) <= {"F32", "F64"}:
                 listing = ", ".join(f"{name} {kind}" for name, kind in kinds.items())
-                raise InvalidFile(
-                    f"{path}: expected a policy's arrays ({', '.join(_ARRAYS)}) of F32 or F64, got {listing[:400]}"
-                )
+                expected = f"a policy's arrays ({', '.join(_ARRAYS)}) of F32 or F64"
+                raise InvalidFile(f"{path}: expected {expected}, got {listing[:400]}")
             arrays = {name: file.get_tensor(name) for name in kinds}
     except (SafetensorError, OSError, ValueError) as error:
         reason = str(error).removeprefix("Error while deserializing header: ")
