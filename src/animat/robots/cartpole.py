@@ -250,16 +250,14 @@ class Cartpole(Robot[CartpoleState]):
         lightest = 4 / 3 - self.pole_mass_kg / total_mass
         force = self.force_n * (1 + self.force_noise)
 
-        def accelerations(angular_velocity: float) -> tuple[float, float]:
-            tmp = (force + self.pole_mass_kg * half_length * angular_velocity**2) / total_mass
-            angular = (self.gravity_m_per_s2 + tmp) / (half_length * lightest)
-            return tmp + self.pole_mass_kg * half_length * angular / total_mass, angular
-
         angular_velocity = 2 * self.angle_limit_rad / self.step_s
         velocity = self.track_length_m / self.step_s
         for _ in range(2):
-            linear, angular = accelerations(angular_velocity)
-            velocity, angular_velocity = velocity + self.step_s * linear, angular_velocity + self.step_s * angular
+            tmp = (force + self.pole_mass_kg * half_length * angular_velocity**2) / total_mass
+            angular_acceleration = (self.gravity_m_per_s2 + tmp) / (half_length * lightest)
+            acceleration = tmp + self.pole_mass_kg * half_length * angular_acceleration / total_mass
+            velocity += self.step_s * acceleration
+            angular_velocity += self.step_s * angular_acceleration
         return (
             (self.track_length_m / 2 + self.step_s * velocity, velocity),
             (self.angle_limit_rad + self.step_s * angular_velocity, angular_velocity),
