@@ -125,8 +125,8 @@ def timeline_differences(policy: Policy, timeline: SimulatorTimeline) -> Iterato
     yield from other_culture(policy.culture, timeline.culture)
     first_min = next(iter(policy.recorded_at_min), None)
     if policy.percentiles == "first" and first_min not in (None, float(timeline.start_min[0])):
-        fixed, here = in_min(first_min), in_min(timeline.start_min[0])
-        message = f"the policies' percentiles were fixed from the recording at {fixed}, here from that at {here}"
+        fixed = f"{in_min(first_min)}, which is not the first of these ({in_min(timeline.start_min[0])})"
+        message = f"the policies' percentiles were fixed from the recording at {fixed}"
         yield Finding("other-percentiles", "warning", message)
 
 

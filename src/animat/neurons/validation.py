@@ -175,7 +175,7 @@ class Validation:
         drifted = f", as responses {'fell' if self.drift < 0 else 'rose'} by {100 * abs(self.drift):.0f} % meanwhile"
         off += drifted if abs(self.drift) > SMALL_DISTANCE / 2 else ""
         if self.is_blocked:
-            return "Cannot be trusted: presented in blocks, but a loop mixes conditions; record with --order mixed"
+            return "Cannot be trusted: conditions were presented in blocks, unlike in a loop; record with --order mixed"
         # If nearly all responses are in one class, what is added for empty classes looks like information.
         for gain, unit in ((conditions, "bits"), (self.gain("empirical", MARGINAL, "crps_hz"), "Hz of CRPS")):
             if not gain.is_certain:

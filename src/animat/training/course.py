@@ -156,12 +156,10 @@ class Course:
         for kept, new in zip(jax.tree.leaves(best), jax.tree.leaves(deployed), strict=True):
             kept[is_best] = np.asarray(new)[is_best]
         passed = [_passes(self._stages[stage], *row) for stage, row in zip(lesson, new_score, strict=True)]
-        self.state = CourseState(
-            np.minimum(lesson + passed, len(self._stages) - 1),
-            table,
-            best,
-            np.where(is_best, index, best_at),
-            np.where(is_best[:, None], new_score, score),
+        self.state = self.state._replace(
+            lesson=np.minimum(lesson + passed, len(self._stages) - 1),
+            best_at=np.where(is_best, index, best_at),
+            score=np.where(is_best[:, None], new_score, score),
         )
 
     def _scores(self, networks: Network, simulator: Neurons) -> Float64[np.ndarray, "policies 2"]:
