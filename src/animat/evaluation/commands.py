@@ -122,10 +122,8 @@ def memory_of(environment: Environment[Any], simulator: Neurons) -> MemorySimula
     if not isinstance(unwrapped(environment), Animat) or simulator is None or not simulator.has_memory:
         return None
     if not isinstance(simulator, MemorySimulator):
-        raise InvalidArgument(
-            f"simulator: expected a MemorySimulator or one without memory, got {type(simulator).__name__}: the optimal "
-            "return cannot be computed, as its history states are not known"
-        )
+        kind = type(simulator).__name__
+        raise InvalidArgument(f"simulator: expected a MemorySimulator or one without memory, got {kind}")
     return simulator
 
 

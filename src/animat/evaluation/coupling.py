@@ -83,10 +83,8 @@ def best_coupling(
     Source: Storn & Price 1997, doi:10.1023/A:1008202821328.
     """
     if isinstance(environment.robot, HostRobot):
-        raise InvalidArgument(
-            f"robot: expected one in JAX, as the search for the best coupling takes thousands of episodes, got "
-            f"{environment.robot.name}, which is stepped in Python"
-        )
+        why = "as the search for the best coupling takes thousands of episodes"
+        raise InvalidArgument(f"robot: expected one in JAX, {why}, got {environment.robot.name}")
     seen = tuple(i for i, quantity in enumerate(environment.robot.observation_spec) if not quantity.of_goal)
     n_commands = environment.robot.n_commands
     stimuli: Any = (None, None)

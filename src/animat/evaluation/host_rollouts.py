@@ -45,23 +45,23 @@ def roll_out_on_host(
 
     `seed` is that of the bodies' episodes; `alike`: whether all actors have the same ones.
     """
-    counts = _zeros(environment, simulator, (len(keys), episodes))
+    n_conditions = 0 if simulator is None or environment.n_actions is None else environment.n_actions
+    shape, presented = (len(keys), episodes), np.zeros((len(keys), n_conditions), np.int64)
+    commanded = np.zeros((*presented.shape, *environment.robot.command_shape))
+    counts = Counts(np.zeros(shape), np.zeros(shape, np.int64), np.zeros(shape, bool), presented, commanded)
     side_by_side = min(AT_ONCE, episodes)
     actors_at_once = max(1, AT_ONCE // side_by_side)
     for begin in range(0, len(keys), actors_at_once):
-        numbers = range(begin, min(begin + actors_at_once, len(keys)))
-        some = slice(numbers.start, numbers.stop)
+        some = slice(begin, begin + actors_at_once)
         acting = jax.tree.map(lambda part, some=some: part[some], actors)
         for first in range(0, episodes, side_by_side):
             # The last wave may run more episodes than requested: the program is compiled for one number.
+            numbers = range(len(keys))[some]
             seeds = [(seed, 0 if alike else number, first + i) for number in numbers for i in range(side_by_side)]
-            columns = slice(first, min(first + side_by_side, episodes))
             folded = jax.vmap(jax.random.fold_in, (0, None))(keys[some], first)
-            wave = _wave(environment, simulator, acting, folded, seeds, columns.stop - first)
-            for whole, part in zip(counts[:3], wave[:3], strict=True):
-                whole[some, columns] = part[:, : columns.stop - first]
-            counts.presented[some] += wave.presented
-            counts.commanded[some] += wave.commanded
+            of_episodes = (each[some, first : first + side_by_side] for each in counts[:3])
+            wave = Counts(*of_episodes, *(each[some] for each in counts[3:]))
+            _count_wave(environment, simulator, acting, folded, seeds, wave)
     return counts
 
 
@@ -87,34 +87,35 @@ def paths_on_host(
     return observations, commands, lengths
 
 
-def _wave(
+def _count_wave(
     environment: Environment[Any],
     simulator: Neurons,
     actors: Any,
     keys: Key[Array, " actors"],
     seeds: Sequence[tuple[int, ...]],
-    counted: int,
-) -> Counts:
-    """One episode of each of several bodies, equally many for each actor; only the first `counted` of each count."""
-    robot, shape = environment.robot, (len(keys), len(seeds) // len(keys))
-    assert isinstance(robot, HostRobot)
-    bodies = _bodies(robot, seeds)
+    counts: Counts,
+) -> None:
+    """Add to counts one episode of each of several bodies, equally many for each actor, of which the first count."""
+    assert isinstance(environment.robot, HostRobot)
+    bodies = _bodies(environment.robot, seeds)
     bodies.begin()
-    going = np.broadcast_to(np.arange(shape[1]) < counted, shape).copy()
-    counts = _zeros(environment, simulator, shape)
-    of_actor = np.indices(shape)[0]
+    n = counts.returns.shape[1]
+    going = np.ones(counts.returns.shape, bool)
+    of_actor, commanded = np.indices(counts.returns.shape)[0], np.zeros_like(counts.commanded)
     for command, delivered, stepped in _iterations(environment, simulator, actors, keys, bodies):
-        counts.returns[:] += np.where(going, stepped.reward.reshape(shape), 0.0)
+        of_bodies = stepped.reward, stepped.terminated, stepped.ended
+        reward, terminated, ended = (each.reshape(len(keys), -1)[:, :n] for each in of_bodies)
+        counts.returns[:] += np.where(going, reward, 0.0)
         counts.lengths[:] += going
-        counts.terminated[:] |= going & stepped.terminated.reshape(shape)
+        counts.terminated[:] |= going & terminated
         if counts.presented.size:
-            at = of_actor[going], delivered[going]
+            at = of_actor[going], delivered[:, :n][going]
             np.add.at(counts.presented, at, 1)
-            np.add.at(counts.commanded, at, command[going])
-        going &= ~stepped.ended.reshape(shape)
+            np.add.at(commanded, at, command[:, :n][going])
+        going &= ~ended
         if not going.any():
             break
-    return counts
+    counts.commanded[:] += commanded
 
 
 def _iterations(
@@ -139,14 +140,6 @@ def _bodies(robot: HostRobot, seeds: Sequence[tuple[int, ...]]) -> Bodies:
         bodies = _LAST.bodies = Bodies(robot, seeds)
     bodies.reseed(seeds)
     return bodies
-
-
-def _zeros(environment: Environment[Any], simulator: Neurons, shape: tuple[int, int]) -> Counts:
-    """Counts of 0, for `shape` = (actors, episodes)."""
-    n = 0 if simulator is None or environment.n_actions is None else environment.n_actions
-    presented = np.zeros((shape[0], n), np.int64)
-    commanded = np.zeros((*presented.shape, *environment.robot.command_shape))
-    return Counts(np.zeros(shape), np.zeros(shape, np.int64), np.zeros(shape, bool), presented, commanded)
 
 
 @partial(jax.jit, static_argnums=(0, 2), compiler_options=COMPILER_OPTIONS)

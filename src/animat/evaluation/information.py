@@ -40,11 +40,8 @@ class GoalInformation:
 
     def to_text(self) -> str:
         """One line."""
-        bits = self.bits
-        return (
-            f"goal information {bits.value:.2f} of {self.most:.2f} bits ({bits.low:.2f} to {bits.high:.2f}; "
-            f"permutation test of no dependence on the goal: p = {self.p:.2g})"
-        )
+        bits, test = self.bits, f"permutation test of no dependence on the goal: p = {self.p:.2g}"
+        return f"goal information {bits.value:.2f} of {self.most:.2f} bits ({bits.low:.2f} to {bits.high:.2f}; {test})"
 
 
 def goal_information(

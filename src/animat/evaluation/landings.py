@@ -107,10 +107,8 @@ class Motion:
             *parts, apart = self._from_rows(jnp.arange(start, start + at_once, dtype=jnp.int32))
             # Rounding may separate the nodes of a row by the last bits, but not more.
             if apart > 0.01:
-                raise InvalidArgument(
-                    f"grid: expected a first coordinate that does not influence how the others change, got "
-                    f"{grid.along.name}"
-                )
+                name = grid.along.name
+                raise InvalidArgument(f"grid: expected a first coordinate that does not change the others, got {name}")
             for whole, part in zip(landings, parts, strict=True):
                 whole[:, start : start + at_once] = part
         return landings

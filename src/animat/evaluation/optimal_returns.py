@@ -117,10 +117,8 @@ def with_enough_samples(responses: Responses) -> tuple[Responses, tuple[str, ...
     n = [len(responses.rates_of(i)) for i in range(len(responses.conditions))]
     few = too_few(responses.conditions, n)
     if len(few) == len(n):
-        raise UnusableData(
-            f"responses: expected at least {FEW_SAMPLES} non-burst ones to some condition, got at most "
-            f"{max(n, default=0)}: record more trials"
-        )
+        most = f"at most {max(n, default=0)}: record more trials"
+        raise UnusableData(f"responses: expected at least {FEW_SAMPLES} non-burst ones to some condition, got {most}")
     return responses.only([i for i, count in enumerate(n) if count >= FEW_SAMPLES]) if few else responses, few
 
 

@@ -78,10 +78,9 @@ class Optimum:
             text += f", {100 * interval.confidence:g} % interval {interval.low:.1f} to {interval.high:.1f}"
         text += f" (grid {self.grid_error:.1f})"
         if self.episodes:
-            text += (
-                f"; its controller, run: {self.monte_carlo:.1f} +- {self.standard_error:.1f}, without knowing the time "
-                f"left {self.without_clock:.1f} +- {self.without_clock_standard_error:.1f}"
-            )
+            known = f"{self.monte_carlo:.1f} +- {self.standard_error:.1f}"
+            unknown = f"{self.without_clock:.1f} +- {self.without_clock_standard_error:.1f}"
+            text += f"; its controller, run: {known}, without knowing the time left {unknown}"
         if self.left_out:
             text += f"; too few responses to count: {', '.join(self.left_out)}"
         return text
@@ -160,10 +159,8 @@ def best_returns(
     layers = max(1 if memory_of(*case) is None else CLASSES for case in cases)
     kept_mib = 2 * fine.size * layers * robot.episode_limit / 2**20
     if episodes and kept_mib > _MOST_MIB:
-        raise InvalidArgument(
-            f"resolution: expected a grid whose tables fit into {_MOST_MIB / 1024:g} GiB, got {resolution:g}, which "
-            f"takes {kept_mib / 1024:.3g} GiB ({robot.episode_limit:,} iterations per episode): use a smaller one"
-        )
+        most, took = f"{_MOST_MIB / 1024:g} GiB", f"{resolution:g}, which takes {kept_mib / 1024:.3g} GiB"
+        raise InvalidArgument(f"resolution: expected tables that fit into {most}, got {took}: use a smaller one")
     at_once = max(1, int(_TABLES_AT_ONCE_MIB / kept_mib))
     optima: list[Optimum] = []
     for start in range(0, len(cases), at_once):
@@ -198,10 +195,8 @@ def _expect_known(environment: Environment[Any]) -> None:
         inmost = inmost.inside
     kind, kinds = type(inmost), (Animat, WithoutNeurons)
     if (kind.respond, kind.advance) not in [(known.respond, known.advance) for known in kinds]:
-        raise InvalidArgument(
-            "environment: expected an Animat or WithoutNeurons, with a limit, neural observation, shuffled delivery or "
-            f"trial costs at most, got {kind.__name__}, whose optimal return is not known"
-        )
+        got = f"{kind.__name__}, whose optimal return is not known"
+        raise InvalidArgument(f"environment: expected an Animat or WithoutNeurons, in wrappers of animat, got {got}")
 
 
 # At module level, so that it is compiled once, with the clock and without.

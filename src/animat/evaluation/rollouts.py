@@ -169,16 +169,12 @@ def check_at_once(name: str, episodes: int, n_actors: int) -> None:
     """Refuse fewer than one episode, or more than fit side by side (InvalidArgument, with the argument's name)."""
     expect_at_least(name, episodes, 1)
     if episodes * n_actors > MOST_AT_ONCE:
-        raise InvalidArgument(
-            f"{name}: expected at most {MOST_AT_ONCE // n_actors:,} each, as {n_actors} run side by side, got "
-            f"{shown(episodes)}"
-        )
+        most = f"{MOST_AT_ONCE // n_actors:,} each, as {n_actors} run side by side"
+        raise InvalidArgument(f"{name}: expected at most {most}, got {shown(episodes)}")
 
 
 def networks_of(policies: Sequence[Policy], *, greedy: bool = False) -> Networks:
-    """Stack the networks of policies; raises InvalidArgument if there are none, or their shapes differ."""
-    if not policies:
-        raise InvalidArgument("policies: expected at least one, got none")
+    """Stack the networks of policies, at least one; raises InvalidArgument if their shapes differ."""
     if len({tuple(w.shape for w in policy.weights) for policy in policies}) > 1:
         raise InvalidArgument("policies: expected networks of one shape, got several: evaluate them one by one")
     layers = (

@@ -110,12 +110,10 @@ def p_of_u(u: float, n_first: int, n_second: int) -> float:
         z = (|U - m| - 1/2) / s,    m = n_1 n_2 / 2,    s^2 = n_1 n_2 (n_1 + n_2 + 1) / 12,
         p = min(1, 2 (1 - Phi(z)))
 
-    Refuses an empty group, and a U that is impossible for groups of these sizes (InvalidArgument).
+    Refuses a U that is impossible for groups of these sizes (InvalidArgument); neither is empty.
     """
     from scipy.stats import norm
 
-    if n_first < 1 or n_second < 1:
-        raise InvalidArgument(f"n: expected at least 1 sample in each group, got {n_first} and {n_second}")
     total = n_first * n_second
     if not 0 <= u <= total:
         raise InvalidArgument(f"u: expected 0 to {total} for {n_first} and {n_second} samples, got {u:g}")
@@ -174,9 +172,7 @@ def normalised_score(policy: float, random: float, optimum: float) -> float:
     Raises InvalidArgument if the optimum is not above the random policy: nothing can be learned.
     """
     if not optimum > random:
-        raise InvalidArgument(
-            f"optimum: expected more than the random policy's {random:g}, got {optimum:g}: no controller is better"
-        )
+        raise InvalidArgument(f"optimum: expected more than the random policy's {random:g}, got {optimum:g}")
     return (policy - random) / (optimum - random)
 
 
@@ -309,11 +305,9 @@ class Verdict:
             parts.append(f"the policies do not outperform these controls: {', '.join(not_outperformed)}")
         if few:
             fewest = min(few.values(), key=lambda each: each.control)
-            parts.append(
-                f"{counted(fewest.policies, 'episode')} of the policies and "
-                f"{fewest.control} of a control are too few to show (p < {OUTPERFORMED_P:g}) whether the policies "
-                f"outperform {', '.join(few)}"
-            )
+            episodes = f"{counted(fewest.policies, 'episode')} of the policies and {fewest.control} of a control"
+            whether = f"(p < {OUTPERFORMED_P:g}) whether the policies outperform {', '.join(few)}"
+            parts.append(f"{episodes} are too few to show {whether}")
         if not parts:
             least = min(each.wins for each in self.controls.values())
             parts.append(

@@ -70,7 +70,6 @@ def bellman_backup(
     Args:
         values: of the next states, at the grid's nodes: row by row, and layer by layer within a row.
         rows, row_places, nodes, places, rewards: the landings, as in `animat.evaluation.landings.Landings`.
-        row_offsets: of the rows around a landing.
         outcomes, weights: of the actions in each layer, the landing and the next layer, and their weights.
         remaining: iterations left after this one.
         lowest, highest: bounds of all values, which interpolation near a cliff could exceed.

@@ -135,7 +135,8 @@ class Evaluation:
         are_counted, cost = first_row.electrode_pulses is not None, first_row.pulse_cost
         pulse_keys = [*["electrode_pulses"] * are_counted, *["net_return"] * bool(cost)]
         names = [name.replace("_", " ") for name in pulse_keys]
-        head = ["", "mean return", "s.e.", "iterations", "ended early", *names, *goal, "score", ""]
+        score_head = ["score"] * (self.optimum is not None)
+        head = ["", "mean return", "s.e.", "iterations", "ended early", *names, *goal, *score_head, ""]
         cells = []
         for row in self.rows:
             fields, score = row.to_dict(), self.score(row)
@@ -144,10 +145,8 @@ class Evaluation:
             numbers.append(f"{100 * fields['terminated_share']:.0f} %")
             numbers += ["" if (value := fields[key]) is None else f"{value:.1f}" for key in pulse_keys]
             numbers += cells_of(row.met) if goal else []
-            cells.append([row.name, *numbers, "" if score is None else f"{score:.2f}", row.meaning])
-        if self.optimum is None:
-            for line in (head, *cells):
-                del line[-2]
+            numbers += ["" if score is None else f"{score:.2f}" for _ in score_head]
+            cells.append([row.name, *numbers, row.meaning])
         policies, episodes = counted(len(first), "policy", "policies"), counted(first.shape[1], "episode")
         lines = [f"{self.robot}, {on}: {policies}, {episodes} each", *align_columns(head, cells)]
         each = ", ".join(f"{name} {x:.1f}" for name, x in zip(self.names, self.rows[0].mean_returns, strict=True))

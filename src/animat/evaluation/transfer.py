@@ -22,34 +22,22 @@ OLD_MIN = 30.0
 def other_presentation(recorded: Presentation | None, presented: Presentation) -> Iterator[Finding]:
     """Warnings if a loop presents stimuli differently from the recordings on which its policies were trained."""
     if recorded is None:
-        message = (
-            f"it is not known how stimuli were presented in the policy's recordings; a closed loop presents "
-            f"{presented}, and a culture's responses depend on the presentation"
-        )
+        message = f"it is not known how stimuli were presented in the recordings; a closed loop presents {presented}"
         yield Finding(UNKNOWN, "warning", message)
         return
     if recorded.order != presented.order:
-        message = (
-            f"the policy's recordings were {recorded.order}: all stimuli of a frequency together; a closed loop "
-            "presents them mixed, to which a culture responds differently: expect less than predicted (for a closed "
-            "loop record with --order mixed, the default)"
-        )
+        were = f"the policy's recordings were {recorded.order}, but a closed loop mixes stimuli"
+        message = f"{were}: expect less than predicted; record with --order mixed, the default"
         yield Finding("other-presentation", "warning", message)
     if recorded.pulses != presented.pulses:
-        message = (
-            f"the policy's recordings had {recorded.pulses} pulse(s) per trial, the loop has {presented.pulses}; "
-            "the response depends on the number of pulses"
-        )
+        message = f"the policy's recordings had {recorded.pulses} pulse(s) per trial, the loop has {presented.pulses}"
         yield Finding("other-presentation", "warning", message)
 
 
 def other_calibration(trained: Presentation | None, predicting: Presentation | None) -> Iterator[Finding]:
     """A warning if the presentation in the predicting recording differs from that in the training recordings."""
     if predicting is not None and predicting != trained:
-        message = (
-            f"the prediction is from a recording presented {predicting}; the presentation in the policies' was "
-            f"{trained or 'unknown'}"
-        )
+        message = f"the prediction is from a recording presented {predicting}, the policies' was {trained or 'unknown'}"
         yield Finding("other-calibration", "warning", message)
 
 
@@ -90,10 +78,8 @@ def old_calibration(age_min: float, now: str) -> Iterator[Finding]:
     """A warning if the predicting recording was made long before another one, or a session."""
     if age_min > OLD_MIN:
         age = f"{age_min:.0f} min" if age_min < 600 else f"{age_min / 60:.0f} h"
-        message = (
-            f"percentiles and prediction are from a recording made {age} before {now}: cultures drift; use a later "
-            "recording (--at-min), or train on later ones"
-        )
+        from_ = f"percentiles and prediction are from a recording made {age} before {now}"
+        message = f"{from_}: cultures drift; use a later recording (--at-min), or train on later ones"
         yield Finding("old-calibration", "warning", message, age_min)
 
 
@@ -124,10 +110,8 @@ def expect_conditions(policy: Policy, conditions: Sequence[Condition], readouts:
     if others := stimulus_mismatch(policy.conditions, conditions):
         raise Mismatch(f"conditions: {others} in the recordings: use those that the policies were trained on")
     if policy.readouts != readouts:
-        raise Mismatch(
-            f"readouts: expected {', '.join(policy.readouts.names)}, with the electrodes on which the policies were "
-            f"trained, got {', '.join(readouts.names)} in the recordings"
-        )
+        trained, got = (", ".join(each.names) for each in (policy.readouts, readouts))
+        raise Mismatch(f"readouts: expected {trained}, with the electrodes of the policies' training, got {got}")
 
 
 def timeline_differences(policy: Policy, timeline: SimulatorTimeline) -> Iterator[Finding]:
@@ -141,10 +125,8 @@ def timeline_differences(policy: Policy, timeline: SimulatorTimeline) -> Iterato
     yield from other_culture(policy.culture, timeline.culture)
     first_min = next(iter(policy.recorded_at_min), None)
     if policy.percentiles == "first" and first_min not in (None, float(timeline.start_min[0])):
-        message = (
-            f"the policies' percentiles were fixed from the recording at {in_min(first_min)}, which is not the first "
-            f"of these: here they are fixed from {in_min(timeline.start_min[0])}"
-        )
+        fixed = f"{in_min(first_min)}, which is not the first of these ({in_min(timeline.start_min[0])})"
+        message = f"the policies' percentiles were fixed from the recording at {fixed}"
         yield Finding("other-percentiles", "warning", message)
 
 
@@ -159,10 +141,8 @@ def loop_differences(policy: Policy, timeline: SimulatorTimeline, minute: float)
     yield from no_memory(timeline.findings_at(minute), timeline.presentation, has_memory=has_memory)
     trained_until = policy.trained_until_min(float(timeline.start_min[0]))
     if trained_until is not None and (newest := float(timeline.start_min[timeline.row_at(trained_until)])) != minute:
-        message = (
-            f"this is the culture at {in_min(minute)}; the policies were last trained on the recording at "
-            f"{in_min(newest)}, which calibrates their closed loop"
-        )
+        calibrating = f"the policies' last recording, which calibrates their closed loop, is that at {in_min(newest)}"
+        message = f"this is the culture at {in_min(minute)}; {calibrating}"
         yield Finding("other-recording", "warning", message, minute - newest)
 
 

@@ -157,10 +157,7 @@ def fit_memory(responses: Responses, *, room: int | None = None, memory: Memory 
         to_jax(left),
         to_jax(followers, np.int32),
         to_jax(np.rint(followers**memory.neighbour_exponent), np.int32),
-        to_jax(toward),
-        to_jax(load.kept),
-        to_jax(load.added),
-        *(to_jax(each) for each in memory),
+        *map(to_jax, (toward, load.kept, load.added, *memory)),
     )
 
 

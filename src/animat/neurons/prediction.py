@@ -65,10 +65,8 @@ def halved(responses: Responses, readout: int | None = None) -> Halves:
     """
     labels = [condition.label for condition in responses.conditions]
     if len(labels) < 2:
-        raise UnusableData(
-            f"conditions: expected two or more, so that there is something to predict from, got "
-            f"{', '.join(labels) or 'none'}; choose others with --conditions, such as interval:5,10+-25%"
-        )
+        got = f"{', '.join(labels) or 'none'}; choose others (--conditions)"
+        raise UnusableData(f"conditions: expected two or more, so that there is something to predict from, got {got}")
     is_held = np.arange(len(responses)) >= len(responses) // 2
     if responses.is_blocked:
         for c in range(len(labels)):
@@ -78,10 +76,8 @@ def halved(responses: Responses, readout: int | None = None) -> Halves:
         usable = ~responses.is_burst & (responses.condition == c)
         n = [int(np.count_nonzero(usable & part)) for part in (~is_held, is_held)]
         if min(n) < FEWEST:
-            raise UnusableData(
-                f"condition {label}: expected {FEWEST} non-burst responses or more in each half of the recording, got "
-                f"{n[0]} and {n[1]}; leave it out with --conditions, or record more trials"
-            )
+            got = f"{n[0]} and {n[1]}; leave it out (--conditions), or record more trials"
+            raise UnusableData(f"condition {label}: expected {FEWEST} non-burst responses in each half, got {got}")
     rows, first = np.flatnonzero(is_held & ~responses.is_burst), responses.at_rows(np.flatnonzero(~is_held))
     x_hz = (responses.read_hz if readout is None else responses.read_hz[:, readout]).astype(np.float32)
     percentiles_hz = np.asarray(pooled_percentiles(first))[... if readout is None else readout]

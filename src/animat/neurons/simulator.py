@@ -105,7 +105,6 @@ class HistogramSimulator(NeuronSimulator):
 
     Attributes:
         cumulative: share of a condition's responses below each edge, shape (conditions, bins + 1).
-        edges_hz: the bins' edges, shape (bins + 1,).
     """
 
     __repr__ = briefly
@@ -146,10 +145,8 @@ class JointHistogramSimulator(NeuronSimulator):
 
     Attributes:
         cumulative: share of a condition's responses below each edge, shape (readouts, conditions, bins + 1).
-        edges_hz: the bins' edges, shape (readouts, bins + 1).
         ranks: of the readouts in each trial, padded with 0, shape (conditions, most trials, readouts).
         counts: trials of each condition, shape (conditions,).
-        percentiles: as in `NeuronSimulator`, shape (readouts, 11).
 
     Source: coupling by an empirical copula, Schefzik, Thorarinsdottir and Gneiting 2013, doi:10.1214/13-STS443.
     """
@@ -167,7 +164,6 @@ class JointHistogramSimulator(NeuronSimulator):
         return self.counts.shape[-1]
 
     def quantile(self, condition: Index, uniform: Scalar) -> Float[Array, " readouts"]:
-        """The responses of all readouts for the trial that a uniform in [0, 1) draws."""
         count = jnp.asarray(self.counts)[condition]
         # float32 rounds a uniform just under 1 times a count up to the count.
         trial = jnp.minimum((uniform * count).astype(jnp.int32), count - 1)
@@ -353,8 +349,6 @@ def _by_condition(responses: Responses) -> list[Float64[np.ndarray, "responses *
     values = [responses.read_hz[kept[responses.condition[kept] == c]] for c in range(len(responses.conditions))]
     for condition, x in zip(responses.conditions, values, strict=True):
         if not len(x):
-            raise UnusableData(
-                f"condition {condition.label}: expected non-burst responses to fit, got none, which --allow cannot "
-                "change: leave the condition out, or choose others (--conditions)"
-            )
+            got = "none, which --allow cannot change: leave it out, or choose others (--conditions)"
+            raise UnusableData(f"condition {condition.label}: expected non-burst responses to fit, got {got}")
     return values

@@ -111,10 +111,8 @@ class SimulatorTimeline:
     def requested_row(self, minute: float) -> int:
         """The same for a minute that a user gave; raises InvalidArgument for one before the first recording, or NaN."""
         if not minute >= self.start_min[0]:
-            raise InvalidArgument(
-                f"at_min: expected a minute on the culture's clock from the first recording on, which started at "
-                f"{self.start_min[0]:g} min, got {minute:g}"
-            )
+            first = f"the first recording on, which started at {self.start_min[0]:g} min"
+            raise InvalidArgument(f"at_min: expected a minute on the culture's clock from {first}, got {minute:g}")
         return self.row_at(minute)
 
     def at(self, minute: float) -> NeuronSimulator:
@@ -162,10 +160,9 @@ def fit_timeline(
         Mismatch: if the recordings differ in conditions, window, presentation or readouts, or two share a minute.
         UnusableData: if a condition of a recording has no non-burst response.
     """
-    series = tuple(series)
-    if not series:
-        raise InvalidArgument("series: expected the responses of at least one recording, got none")
     ordered = sorted(series, key=lambda responses: responses.start_min)
+    if not ordered:
+        raise InvalidArgument("series: expected the responses of at least one recording, got none")
     first = ordered[0]
     kind = kind or default_kind(first)
     if mismatch := series_mismatch(ordered):
@@ -244,10 +241,9 @@ def load_timeline(path: Path) -> SimulatorTimeline:
         )
     except (OSError, ValueError, KeyError, TypeError, SafetensorError, AnimatError) as error:
         reason = f"no entry {error}" if isinstance(error, KeyError) else error
-        raise InvalidFile(
-            f"{path}: expected simulators as animat study and animat tune write them, got a file that cannot be read "
-            f"as such: {reason}; run the command again to replace it"
-        ) from error
+        expected = "simulators as animat study and animat tune write them"
+        got = f"another file ({reason}); run the command again to replace it"
+        raise InvalidFile(f"{path}: expected {expected}, got {got}") from error
 
 
 def fit_simulator(

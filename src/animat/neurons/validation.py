@@ -175,17 +175,12 @@ class Validation:
         drifted = f", as responses {'fell' if self.drift < 0 else 'rose'} by {100 * abs(self.drift):.0f} % meanwhile"
         off += drifted if abs(self.drift) > SMALL_DISTANCE / 2 else ""
         if self.is_blocked:
-            return (
-                "Cannot be trusted: conditions were presented in blocks, but a loop mixes them, and this recording "
-                "does not show what happens then; record with --order mixed"
-            )
+            return "Cannot be trusted: conditions were presented in blocks, unlike in a loop; record with --order mixed"
         # If nearly all responses are in one class, what is added for empty classes looks like information.
         for gain, unit in ((conditions, "bits"), (self.gain("empirical", MARGINAL, "crps_hz"), "Hz of CRPS")):
             if not gain.is_certain:
-                return (
-                    f"Cannot be trusted: knowing the condition is worth {gain.value:.3f} +- {gain.error:.3f} {unit} "
-                    "per trial, which is not clearly above 0, so there is next to nothing to steer with"
-                )
+                worth = f"{gain.value:.3f} +- {gain.error:.3f} {unit} per trial"
+                return f"Cannot be trusted: knowing the condition is worth {worth}, which is not clearly above 0"
         if distance > LARGE_DISTANCE:
             return f"Cannot be trusted: {off} (at most {LARGE_DISTANCE:g} with care)"
         if distance > SMALL_DISTANCE:
@@ -193,10 +188,9 @@ class Validation:
         if lag != lag:
             return "With care: successive responses cannot be compared, as no two neighbours are both non-burst"
         if abs(lag) > LARGE_DIFFERENCE:
-            return (
-                f"With care: successive responses correlate by {self.autocorrelation[0]:.2f}, the simulator's by "
-                f"{scores.autocorrelation.mean[0]:.2f} (at most {LARGE_DIFFERENCE:g} apart to be trusted)"
-            )
+            both = f"{self.autocorrelation[0]:.2f}, the simulator's by {scores.autocorrelation.mean[0]:.2f}"
+            apart = f"at most {LARGE_DIFFERENCE:g} apart to be trusted"
+            return f"With care: successive responses correlate by {both} ({apart})"
         if better:
             return f"With care: the {better[-1]} simulator predicts better; train with --simulator {better[-1]}"
         return (

@@ -90,16 +90,12 @@ class TwoLinkArm(Robot[ArmState]):
     def __post_init__(self) -> None:
         nearest_m, farthest_m = self._target_distances_m
         if nearest_m >= farthest_m:
-            raise InvalidArgument(
-                f"lower_length_m: expected links similar enough to reach a target, got {self.lower_length_m:g} m "
-                f"with an upper link of {self.upper_length_m:g} m"
-            )
+            lengths = f"{self.lower_length_m:g} m with an upper link of {self.upper_length_m:g} m"
+            raise InvalidArgument(f"lower_length_m: expected links similar enough to reach a target, got {lengths}")
         least, _ = self._inertias_kg_m2
         if self.damping_n_m_s * self.step_s > STIFFEST * SUBSTEPS * least:
-            raise InvalidArgument(
-                f"step_s: expected at most {STIFFEST * SUBSTEPS * least / self.damping_n_m_s:.3g} for links so light "
-                f"and joints so damped, got {self.step_s:g}"
-            )
+            most = f"{STIFFEST * SUBSTEPS * least / self.damping_n_m_s:.3g} for links so light and joints so damped"
+            raise InvalidArgument(f"step_s: expected at most {most}, got {self.step_s:g}")
         # At the speed at which damping balances full torque, or, if less, that of the elbow alone at an episode's end.
         torque_n_m, elbow_kg_m2 = max(self.torque_n_m, 1e-9), self._inertia[2]
         damped_s = TURN_RAD * SUBSTEPS * self.damping_n_m_s / torque_n_m
@@ -210,9 +206,8 @@ class TwoLinkArm(Robot[ArmState]):
         """The distance from tip to target over time in each episode."""
         distances_m, radius_m = [np.hypot(path[:, 8], path[:, 9]) for path in paths], self.target_radius_m
         arrived = [bool(distance_m[-1] <= radius_m) for distance_m in distances_m]
-        success, ylabel = "end at the target", "tip to target (m)"
-        draw_over_time(axes, self, distances_m, arrived, limits=[radius_m], success=success, ylabel=ylabel)
-        axes.set_ylim(bottom=0)
+        draw_over_time(axes, self, distances_m, arrived, limits=[radius_m], success="end at the target")
+        axes.set(ylabel="tip to target (m)", ylim=(0, None))
 
     def _to_target(self, state: ArmState) -> tuple[Array, Array]:
         both = state.shoulder_rad + state.elbow_rad

@@ -145,9 +145,6 @@ class Robot(abc.ABC, Generic[State]):
             uniforms: random numbers in [0, 1), shape (noise_size,).
             state: before the iteration.
             u: the motor command in [-1, 1], of `command_shape`.
-
-        Returns:
-            the state after the iteration, the reward in the task's own units, and whether the task ended.
         """
 
     @abc.abstractmethod

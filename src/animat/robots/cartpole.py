@@ -169,10 +169,8 @@ class Cartpole(Robot[CartpoleState]):
         a large angle limit there is none (InvalidArgument).
         """
         if self.angle_limit_rad > 0.75:
-            raise InvalidArgument(
-                f"angle_limit_rad: expected at most 0.75 for the cartpole's own grid, got {self.angle_limit_rad:g}; "
-                "pass a Grid"
-            )
+            most = "0.75 without a grid of your own"
+            raise InvalidArgument(f"angle_limit_rad: expected at most {most}, got {self.angle_limit_rad:g}")
         half_length_m = self.pole_length_m / 2
         total_kg = self.cart_mass_kg + self.pole_mass_kg
         shear_m = 4 / 3 * half_length_m
@@ -237,8 +235,8 @@ class Cartpole(Robot[CartpoleState]):
         """The pole's angle over time in each episode."""
         limit_deg, angles_deg = math.degrees(self.angle_limit_rad), [np.degrees(path[:, 2]) for path in paths]
         stayed, limits = [len(path) > self.episode_limit for path in paths], (-limit_deg, limit_deg)
-        draw_over_time(axes, self, angles_deg, stayed, limits=limits, success="to the end", ylabel="pole angle (deg)")
-        axes.set_ylim(-1.25 * limit_deg, 1.25 * limit_deg)
+        draw_over_time(axes, self, angles_deg, stayed, limits=limits, success="to the end")
+        axes.set(ylabel="pole angle (deg)", ylim=(-1.25 * limit_deg, 1.25 * limit_deg))
 
     def _bounds(self) -> tuple[tuple[float, float], tuple[float, float]]:
         """Bounds of (position, velocity) of the cart and of the pole over whole episodes that start at rest.
@@ -252,16 +250,14 @@ class Cartpole(Robot[CartpoleState]):
         lightest = 4 / 3 - self.pole_mass_kg / total_mass
         force = self.force_n * (1 + self.force_noise)
 
-        def accelerations(angular_velocity: float) -> tuple[float, float]:
-            tmp = (force + self.pole_mass_kg * half_length * angular_velocity**2) / total_mass
-            angular = (self.gravity_m_per_s2 + tmp) / (half_length * lightest)
-            return tmp + self.pole_mass_kg * half_length * angular / total_mass, angular
-
         angular_velocity = 2 * self.angle_limit_rad / self.step_s
         velocity = self.track_length_m / self.step_s
         for _ in range(2):
-            linear, angular = accelerations(angular_velocity)
-            velocity, angular_velocity = velocity + self.step_s * linear, angular_velocity + self.step_s * angular
+            tmp = (force + self.pole_mass_kg * half_length * angular_velocity**2) / total_mass
+            angular_acceleration = (self.gravity_m_per_s2 + tmp) / (half_length * lightest)
+            acceleration = tmp + self.pole_mass_kg * half_length * angular_acceleration / total_mass
+            velocity += self.step_s * acceleration
+            angular_velocity += self.step_s * angular_acceleration
         return (
             (self.track_length_m / 2 + self.step_s * velocity, velocity),
             (self.angle_limit_rad + self.step_s * angular_velocity, angular_velocity),

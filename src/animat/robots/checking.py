@@ -108,10 +108,8 @@ def _check_compiled(robot: Robot[Any]) -> None:
             within = np.clip(number, quantity.low, quantity.high)
             # Up to rounding in float32.
             if not np.isclose(number, within, rtol=1e-5, atol=1e-5 * quantity.scale):
-                raise InvalidArgument(
-                    f"{name}.observe: {quantity.name}: expected from {quantity.low:g} to {quantity.high:g}, the bounds "
-                    f"of its Quantity, got {number:g}"
-                )
+                bounds = f"from {quantity.low:g} to {quantity.high:g}, the bounds of its Quantity"
+                raise InvalidArgument(f"{name}.observe: {quantity.name}: expected {bounds}, got {number:g}")
 
 
 def _expect_grid(what: str, value_grid: Callable[[], Any]) -> None:
@@ -147,10 +145,8 @@ def _expect_attributes(robot: Robot[Any]) -> None:
         raise InvalidArgument(f"{kind}.observation_spec: expected each name once, got {shown(repeated[0])} twice")
     for quantity in spec:
         if not LEAST_SCALE <= quantity.scale <= LARGEST_SCALE:
-            raise InvalidArgument(
-                f"{kind}.observation_spec: {quantity.name}: expected a scale from {LEAST_SCALE:g} to "
-                f"{LARGEST_SCALE:g}, got {quantity.scale:g}; use another unit"
-            )
+            expected = f"a scale from {LEAST_SCALE:g} to {LARGEST_SCALE:g}"
+            raise InvalidArgument(f"{kind}: {quantity.name}: expected {expected}, got {quantity.scale:g}")
     expected = "two numbers, the lowest and the highest return of an episode"
     limits = _call(f"{kind}.return_range", lambda: list(map(float, robot.return_range)), expected=expected)
     if len(limits) != 2 or not limits[0] <= limits[1]:
@@ -194,6 +190,5 @@ def _expect_same_structure(what: str, after: Any, before: Any) -> None:
         for state in (before, after)
     ]
     if (jax.tree.structure(before), leaves[0]) != (jax.tree.structure(after), leaves[1]):
-        raise InvalidArgument(
-            f"{what}: expected the state's structure from reset ({leaves[0]}), got another ({leaves[1]})"
-        )
+        reset, other = leaves
+        raise InvalidArgument(f"{what}: expected the state's structure from reset ({reset}), got another ({other})")

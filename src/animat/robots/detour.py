@@ -47,9 +47,7 @@ class Detour(Wheels):
 
     def __post_init__(self) -> None:
         if len(super()._goals_m) and not len(self._goals_m):
-            raise InvalidArgument(
-                "walls, obstacles: expected some that block the straight path to places within reach, got none that do"
-            )
+            raise InvalidArgument("walls, obstacles: expected some that block the straight path to places, got none")
         super().__post_init__()
 
     def heuristic(self, observation: Any) -> Any:

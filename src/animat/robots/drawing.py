@@ -82,7 +82,6 @@ def draw_over_time(
     *,
     limits: Sequence[float],
     success: str,
-    ylabel: str,
 ) -> None:
     """Draw one number of each episode over time, coloured by how the episode ended, well (`success`) or not."""
     for course, is_good in zip(values, ended_well, strict=True):
@@ -91,7 +90,7 @@ def draw_over_time(
     for limit in limits:
         axes.axhline(limit, color=EDGE, linewidth=0.8, linestyle="--")
     axes.set_xlim(0, robot.episode_limit * robot.step_s)
-    axes.set(xlabel=f"time (s); {sum(ended_well)} of {len(values)} {success}", ylabel=ylabel)
+    axes.set_xlabel(f"time (s); {sum(ended_well)} of {len(values)} {success}")
 
 
 class Canvas:

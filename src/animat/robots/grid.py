@@ -38,10 +38,8 @@ class Axis:
 
     def __post_init__(self) -> None:
         if not (self.nodes >= TAPS and math.isfinite(self.high - self.low) and self.high > self.low):
-            raise InvalidArgument(
-                f"axis {self.name}: expected rising ends and at least {TAPS} nodes, got {self.low:g} to "
-                f"{self.high:g} with {self.nodes}"
-            )
+            got = f"{self.low:g} to {self.high:g} with {self.nodes}"
+            raise InvalidArgument(f"axis {self.name}: expected rising ends and at least {TAPS} nodes, got {got}")
 
     @property
     def step(self) -> float:

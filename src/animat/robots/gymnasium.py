@@ -110,17 +110,11 @@ class GymnasiumRobot(HostRobot):
         module = self.id.rpartition(":")[0]
         # A file could name any module.
         if module and module not in sys.modules:
-            raise InvalidArgument(
-                f"{self.name}: expected {module} to be imported, got only a policy: import it first (on the command "
-                f"line: --robot {self.name})"
-            )
+            how = f"import it first (on the command line: --robot {self.name})"
+            raise InvalidArgument(f"{self.name}: expected {module} to be imported, got only a policy: {how}")
         body = _Environment(self.id, self.settings, with_pictures=with_pictures)
         if (body.low, body.high, body.levels, body.observed) != (self.low, self.high, self.levels, len(self.scales)):
-            raise InvalidArgument(
-                f"{self.name}: expected the spaces that the policy was made with, of {len(self.scales)} observations "
-                f"and {self.levels or len(self.low)} {'levels' if self.levels else 'actions'}, got different ones: the "
-                "environment's version differs"
-            )
+            raise InvalidArgument(f"{self.name}: expected the policy's spaces, got those of another version")
         return body
 
     def prepare(self) -> None:
@@ -142,9 +136,8 @@ class GymnasiumRobot(HostRobot):
             if module := id.rpartition(":")[0]:
                 importlib.import_module(module)
         except (Exception, SystemExit) as error:
-            raise InvalidArgument(
-                f"robot: expected {FAMILY}:module:Id with a module that can be imported, got {first_line(error)}"
-            ) from error
+            expected = f"{FAMILY}:module:Id with a module that can be imported"
+            raise InvalidArgument(f"robot: expected {expected}, got {first_line(error)}") from error
 
     @classmethod
     def named(cls, id: str, /, *, episode_limit: int | None = None, **settings: float) -> GymnasiumRobot:
@@ -174,9 +167,8 @@ def _inspected(id: str, episode_limit: int | None, settings: tuple[tuple[str, fl
         body = _Environment(id, settings)
     limit = body.limit if episode_limit is None else episode_limit
     if limit is None:
-        raise InvalidArgument(
-            f"{FAMILY}:{id}: expected an episode limit, got an environment without one: --parameters episode_limit=1000"
-        )
+        got = "an environment without one: --parameters episode_limit=1000"
+        raise InvalidArgument(f"{FAMILY}:{id}: expected an episode limit, got {got}")
     robot = GymnasiumRobot(id, settings, limit, body.low, body.high, body.levels, (1.0,) * body.observed, False)
     return replace(robot, scales=measured_scales(robot, body.bounds), keeps_state=is_repeatable(robot))
 
@@ -229,9 +221,8 @@ class _Environment(Body):
         if not self._is_flat:
             observation = np.reshape(observation, -1)
         if len(observation) != self.observed:
-            raise InvalidArgument(
-                f"{self._name}: expected observations of {self.observed} numbers, got one of {len(observation)}"
-            )
+            n = self.observed
+            raise InvalidArgument(f"{self._name}: expected observations of {n} numbers, got one of {len(observation)}")
         return observation  # type: ignore[no-any-return]
 
 
@@ -247,10 +238,8 @@ def _reason(error: Exception | SystemExit) -> str:
 def _expect_sound_mujoco(name: str, env: Any) -> None:
     is_of_mujoco = hasattr(env.unwrapped, "model") and "mujoco" in sys.modules
     if is_of_mujoco and getattr(sys.modules["mujoco"], "__version__", "") == "4.0.0":
-        raise InvalidArgument(
-            f"{name}: expected a MuJoCo that computes accelerations correctly, got 4.0.0, which does not: "
-            f"{pip_install('mujoco<4')}"
-        )
+        expected = "a MuJoCo that computes accelerations correctly"
+        raise InvalidArgument(f"{name}: expected {expected}, got 4.0.0, which does not: {pip_install('mujoco<4')}")
 
 
 def _commands(name: str, space: Any) -> tuple[tuple[float, ...], tuple[float, ...], int]:

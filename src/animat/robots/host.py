@@ -79,10 +79,8 @@ class HostRobot(Robot[Any]):
 
     def advance(self, uniforms: Any, state: Any, u: Any) -> Any:
         """Refused: it is stepped outside JAX."""
-        raise InvalidArgument(
-            f"robot: expected one that is stepped in JAX, got {self.name}, which is stepped outside JAX: only train, "
-            "evaluate, run, live and studies take it"
-        )
+        got = f"{self.name}, which only train, evaluate, run, live and studies take"
+        raise InvalidArgument(f"robot: expected one that is stepped in JAX, got {got}")
 
     def observe(self, state: Float[Array, " observations"]) -> Float[Array, " observations"]:
         """The last observation."""

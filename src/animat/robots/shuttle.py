@@ -68,14 +68,11 @@ class Shuttle(Robot[ShuttleState]):
 
     def __post_init__(self) -> None:
         if self.place_radius_m >= self.place_m:
-            raise InvalidArgument(
-                f"place_radius_m: expected less than {self.place_m:g}, so that the places do not overlap, got "
-                f"{self.place_radius_m:g}"
-            )
+            most = f"{self.place_m:g}, so that the places do not overlap"
+            raise InvalidArgument(f"place_radius_m: expected less than {most}, got {self.place_radius_m:g}")
         if self.place_m > self.track_length_m / 2:
-            raise InvalidArgument(
-                f"place_m: expected at most {self.track_length_m / 2:g}, where the track ends, got {self.place_m:g}"
-            )
+            most = f"{self.track_length_m / 2:g}, where the track ends"
+            raise InvalidArgument(f"place_m: expected at most {most}, got {self.place_m:g}")
 
     @property
     def return_range(self) -> tuple[float, float]:
@@ -169,6 +166,6 @@ class Shuttle(Robot[ShuttleState]):
         towards_m = [path[:, 0] * path[0, 2] for path in paths]
         arrived = [bool(abs(positions[-1] - self.place_m) <= self.place_radius_m) for positions in towards_m]
         edges_m = (self.place_m - self.place_radius_m, self.place_m + self.place_radius_m)
-        success, ylabel = "end at their place", "position on the cue's side (m)"
-        draw_over_time(axes, self, towards_m, arrived, limits=edges_m, success=success, ylabel=ylabel)
-        axes.set_ylim(-0.55 * self.track_length_m, 0.55 * self.track_length_m)
+        draw_over_time(axes, self, towards_m, arrived, limits=edges_m, success="end at their place")
+        most_m = 0.55 * self.track_length_m
+        axes.set(ylabel="position on the cue's side (m)", ylim=(-most_m, most_m))

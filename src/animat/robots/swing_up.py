@@ -178,9 +178,8 @@ class SwingUp(Robot[SwingUpState]):
         limit_deg = math.degrees(self.upright_rad)
         off_deg = [np.degrees(np.arccos(np.clip(path[:, 0], -1, 1))) for path in paths]
         stood = [bool(angles[-1] <= limit_deg) for angles in off_deg]
-        ylabel = "angle from upright (deg)"
-        draw_over_time(axes, self, off_deg, stood, limits=[limit_deg], success="end upright", ylabel=ylabel)
-        axes.set_ylim(0, 185)
+        draw_over_time(axes, self, off_deg, stood, limits=[limit_deg], success="end upright")
+        axes.set(ylabel="angle from upright (deg)", ylim=(0, 185))
 
     @property
     def _gravity_per_s2(self) -> float:

@@ -97,11 +97,10 @@ class Wheels(Robot[WheelsState]):
             most_s = min(self.body_radius_m, math.pi * self.wheel_distance_m) / self.max_speed_m_per_s
             raise InvalidArgument(f"step_s: expected at most {most_s:.3g} at this speed, got {self.step_s:g}")
         if not len(self._goals_m):
-            raise InvalidArgument(
-                "start_x_m, start_y_m: expected a place within the walls, with room for the robot and for goals that "
-                f"it can reach (in at most {MOST_PLACES * (APART * self.body_radius_m) ** 2:.3g} m^2), got "
-                f"{self.start_x_m:g}, {self.start_y_m:g}"
-            )
+            area = f"in at most {MOST_PLACES * (APART * self.body_radius_m) ** 2:.3g} m^2"
+            expected = f"a place within the walls, with room for the robot and goals that it can reach ({area})"
+            got = f"{self.start_x_m:g}, {self.start_y_m:g}"
+            raise InvalidArgument(f"start_x_m, start_y_m: expected {expected}, got {got}")
         left, top, right, bottom = self._around.box_m()
         x_m, y_m = self._within_reach(SLIPPING).T
         if x_m.min() <= left or x_m.max() >= right or y_m.min() <= top or y_m.max() >= bottom:
@@ -205,9 +204,8 @@ class Wheels(Robot[WheelsState]):
         """The distance to the goal over time in each episode."""
         distances_m, radius_m = [path[:, 8] for path in paths], self.goal_radius_m
         arrived = [bool(distance_m[-1] <= radius_m) for distance_m in distances_m]
-        ylabel = "distance to the goal (m)"
-        draw_over_time(axes, self, distances_m, arrived, limits=[radius_m], success="arrived", ylabel=ylabel)
-        axes.set_ylim(bottom=0)
+        draw_over_time(axes, self, distances_m, arrived, limits=[radius_m], success="arrived")
+        axes.set(ylabel="distance to the goal (m)", ylim=(0, None))
 
     @property
     def _around(self) -> Surroundings:

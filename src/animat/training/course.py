@@ -80,9 +80,8 @@ def rows_of(training: Training, timeline: SimulatorTimeline | None) -> list[tupl
         drawn = np.flatnonzero((timeline.start_min >= low) & (timeline.start_min <= min(high, until_min)))
         if not len(drawn):
             known = ", ".join(f"{minute:g}" for minute in timeline.start_min if minute <= until_min)
-            raise InvalidArgument(
-                f"lesson {number}: recordings_min: expected minutes with a recording ({known}), got [{low:g}, {high:g}]"
-            )
+            expected = f"minutes with a recording ({known})"
+            raise InvalidArgument(f"lesson {number}: recordings_min: expected {expected}, got [{low:g}, {high:g}]")
         rows.append((int(drawn[0]), int(drawn[-1])))
     return rows
 
@@ -142,7 +141,8 @@ class Course:
         if not training.episodes_assessed:
             return
         minute = self._minute(index)
-        if index and self._row(minute) != self._row(self._minute(index - 1)):
+        timeline = self._timeline
+        if timeline and index and timeline.row_at(minute) != timeline.row_at(self._minute(index - 1)):
             # A culture is easier to control at some minutes than at others: compare on the simulator now in use.
             score = self._scores(best, simulator)
         new_score = self._scores(deployed, simulator)
@@ -156,12 +156,10 @@ class Course:
         for kept, new in zip(jax.tree.leaves(best), jax.tree.leaves(deployed), strict=True):
             kept[is_best] = np.asarray(new)[is_best]
         passed = [_passes(self._stages[stage], *row) for stage, row in zip(lesson, new_score, strict=True)]
-        self.state = CourseState(
-            np.minimum(lesson + passed, len(self._stages) - 1),
-            table,
-            best,
-            np.where(is_best, index, best_at),
-            np.where(is_best[:, None], new_score, score),
+        self.state = self.state._replace(
+            lesson=np.minimum(lesson + passed, len(self._stages) - 1),
+            best_at=np.where(is_best, index, best_at),
+            score=np.where(is_best[:, None], new_score, score),
         )
 
     def _scores(self, networks: Network, simulator: Neurons) -> Float64[np.ndarray, "policies 2"]:
@@ -177,9 +175,6 @@ class Course:
         if self._timeline is None or self._training.shadowing == "drawn":
             return np.nan
         return float(self._timeline.start_min[0]) + self._training.minute(index)
-
-    def _row(self, minute: float) -> int:
-        return 0 if self._timeline is None or np.isnan(minute) else self._timeline.row_at(minute)
 
     def note(self) -> str:
         """The lesson of each policy, for the progress line; empty if there is only one."""

@@ -51,9 +51,8 @@ def expect_trainable(training: Training, *, is_saved: bool) -> None:
     if isinstance(robot, HostRobot) and not robot.keeps_episodes and robot.episode_limit > rounds:
         needed = robot.episode_limit * CHUNKS * training.algorithm.environments
         raise InvalidArgument(
-            f"iterations: expected {needed:,} or more, or an episode_limit of {rounds} or less, as the episodes of "
-            f"{robot.name} cannot be kept in a checkpoint and restart at each sixtieth of the training, got "
-            f"{training.iterations:,} iterations and episodes of {robot.episode_limit:,}"
+            f"iterations: expected {needed:,} or more, or an episode_limit of {rounds} or less, as episodes of "
+            f"{robot.name} restart at each sixtieth of the training, got {training.iterations:,}"
         )
     if mapping is None:
         training.environment(0)

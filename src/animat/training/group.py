@@ -205,10 +205,8 @@ class SideBySide:
         if self._diagnose is not None:
             # Before a checkpoint is written, which training could never recover from.
             if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(self._learners.deployed)):
-                raise UnusableData(
-                    f"{training.robot.name}: expected finite rewards and observations, got NaN or infinite ones "
-                    f"within {iterations[0]:,} iterations"
-                )
+                got = f"NaN or infinite ones within {iterations[0]:,} iterations"
+                raise UnusableData(f"{training.robot.name}: expected finite rewards and observations, got {got}")
             available = jnp.int32(min(last * algorithm.environments, algorithm.replay))
             diagnosis = self._diagnose(self._learners, available)
         with np.errstate(invalid="ignore"):
@@ -323,9 +321,7 @@ def _read_checkpoint(path: Path, fingerprint: str, like: Any) -> tuple[int, Any,
     except InvalidFile:
         raise
     except Exception as error:  # numpy, zipfile and zlib raise a dozen kinds of errors for a damaged archive
-        raise InvalidFile(
-            f"{path}: expected a checkpoint, got a file that cannot be read ({error}); remove it"
-        ) from error
+        raise InvalidFile(f"{path}: expected a checkpoint, got one that cannot be read ({error}); remove it") from error
     return done, jax.tree.unflatten(structure, values), curve
 
 

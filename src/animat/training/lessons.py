@@ -90,29 +90,21 @@ def stages_of(lessons: Sequence[Lesson]) -> tuple[Lesson, ...]:
 def expect_lessons(lessons: Sequence[Lesson], robot: Robot[Any], *, draws_recordings: bool) -> None:
     """Refuse lessons that do not fit this robot."""
     if lessons and isinstance(robot, HostRobot):
-        raise InvalidArgument(
-            f"lessons: expected a robot that is stepped by JAX, got {robot.name}, which its own library steps"
-        )
+        raise InvalidArgument(f"lessons: expected a robot that is stepped by JAX, got {robot.name}")
     for number, lesson in enumerate(lessons, 1):
         with within(f"lesson {number} ({lesson.name})" if lesson.name else f"lesson {number}"):
             if number < len(lessons) and not lesson.has_threshold:
-                raise InvalidArgument(
-                    "expected success or until_return, which say when to move on to the next lesson, got neither"
-                )
+                raise InvalidArgument("expected success or until_return, to move on to the next lesson, got neither")
             _expect_lesson(lesson, robot, draws_recordings)
 
 
 def _expect_lesson(lesson: Lesson, robot: Robot[Any], draws_recordings: bool) -> None:
     if lesson.success is not None and not hasattr(robot, "succeeded"):
-        raise InvalidArgument(
-            f"success: expected a robot that reports whether an episode succeeded, got {robot.name}, which has no "
-            "method `succeeded`; use until_return"
-        )
+        got = f"{robot.name}, which has no method `succeeded`; use until_return"
+        raise InvalidArgument(f"success: expected a robot that reports success, got {got}")
     if lesson.recordings_min is not None and not draws_recordings:
-        raise InvalidArgument(
-            "recordings_min: expected only with shadowing 'drawn' (--shadowing drawn), got it with all episodes on the "
-            "same recordings"
-        )
+        expected = "only with shadowing 'drawn' (--shadowing drawn)"
+        raise InvalidArgument(f"recordings_min: expected {expected}, got it without")
     body: Any = without_goal(robot)
     numbers = {f.name: getattr(body, f.name) for f in dataclasses.fields(body)}
     if len(lesson.parameters) > MOST_VARIED:
@@ -123,10 +115,8 @@ def _expect_lesson(lesson: Lesson, robot: Robot[Any], draws_recordings: bool) ->
             near = did_you_mean(name, numbers) or f"; there are {known}"
             raise InvalidArgument(f"parameters: expected parameters of {robot.name}, got {name!r}{near}")
         if not isinstance(numbers[name], float):
-            raise InvalidArgument(
-                f"parameters.{name}: expected a parameter that is a real number, got one that is {numbers[name]!r}: it "
-                "is part of the compiled program, and cannot vary"
-            )
+            got = f"one that is {numbers[name]!r}, which cannot vary"
+            raise InvalidArgument(f"parameters.{name}: expected a parameter that is a real number, got {got}")
     # If a combination is invalid anywhere, it is invalid at a corner.
     most = -math.inf
     for corner in itertools.product(*lesson.parameters.values()):
@@ -136,6 +126,5 @@ def _expect_lesson(lesson: Lesson, robot: Robot[Any], draws_recordings: bool) ->
             varied: Robot[Any] = dataclasses.replace(body, **values)
             most = max(most, (varied if body is robot else robot).return_range[1])
     if lesson.until_return is not None and lesson.until_return > most:
-        raise InvalidArgument(
-            f"until_return: expected at most {most:g}, the highest return of {robot.name}, got {lesson.until_return:g}"
-        )
+        most_text = f"{most:g}, the highest return of {robot.name}"
+        raise InvalidArgument(f"until_return: expected at most {most_text}, got {lesson.until_return:g}")

@@ -128,15 +128,11 @@ class Policy:
         widths = [n_inputs, *(bias.size for bias in self.biases)]
         shapes = [weight.shape for weight in self.weights]
         if len(widths) != 4 or widths[-1] != n_outputs or min(widths) < 1 or shapes != list(itertools.pairwise(widths)):
-            raise InvalidArgument(
-                f"weights: expected three layers from {widths[0]} observations of {self.robot.name} to {n_outputs} "
-                f"outputs, got shapes {shapes}"
-            )
-        if any(bias.ndim != 1 for bias in self.biases) or self.scales.shape != (widths[0],):
-            raise InvalidArgument(
-                f"scales, biases: expected one for each of {widths[0]} observations and of each layer's outputs, got "
-                f"shapes {self.scales.shape} and {[bias.shape for bias in self.biases]}"
-            )
+            expected = f"three layers from {n_inputs} observations of {self.robot.name} to {n_outputs} outputs"
+            raise InvalidArgument(f"weights: expected {expected}, got shapes {shapes}")
+        others = [self.scales.shape, *(bias.shape for bias in self.biases)]
+        if others != [(width,) for width in widths]:
+            raise InvalidArgument(f"scales, biases: expected vectors of {widths} numbers, got shapes {others}")
         for name, arrays in (("weights", self.weights), ("biases", self.biases), ("scales", (self.scales,))):
             if kinds := {str(array.dtype) for array in arrays} - {"float32"}:
                 raise InvalidArgument(f"{name}: expected float32, got {', '.join(kinds)}")
@@ -144,9 +140,8 @@ class Policy:
             if name != "scales" and not all(np.all(np.abs(array) <= _LARGEST) for array in arrays):
                 raise InvalidArgument(f"{name}: expected finite numbers up to {_LARGEST:g}, got NaN or larger ones")
         if not np.all((self.scales >= LEAST_SCALE) & (self.scales <= LARGEST_SCALE)):
-            raise InvalidArgument(
-                f"scales: expected numbers from {LEAST_SCALE:g} to {LARGEST_SCALE:g}, got {self.scales.tolist()}"
-            )
+            limits = f"from {LEAST_SCALE:g} to {LARGEST_SCALE:g}"
+            raise InvalidArgument(f"scales: expected numbers {limits}, got {self.scales.tolist()}")
 
     @property
     def n_actions(self) -> int | None:
@@ -203,9 +198,8 @@ class Policy:
         shape = self.scales.shape
         # An array's attribute comes first, as reading it takes only a hundredth of a decision's time.
         if getattr(observation, "shape", None) != shape and np.shape(observation) != shape:
-            raise InvalidArgument(
-                f"observation: expected one of {self.robot.name}, shape {shape}, got shape {np.shape(observation)}"
-            )
+            got, name = np.shape(observation), self.robot.name
+            raise InvalidArgument(f"observation: expected one of {name}, shape {shape}, got shape {got}")
         hidden = observation / self.scales
         for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
             hidden = hidden @ weight
@@ -327,15 +321,13 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray[Any, Any]], dict[str, Any]]:
             kinds = {name: file.get_slice(name).get_dtype() for name in file.keys()}  # noqa: SIM118
             if set(kinds) - {"assessments"} != set(_ARRAYS) or not set(kinds.values()) <= {"F32", "F64"}:
                 listing = ", ".join(f"{name} {kind}" for name, kind in kinds.items())
-                raise InvalidFile(
-                    f"{path}: expected a policy's arrays ({', '.join(_ARRAYS)}) of F32 or F64, got {listing[:400]}"
-                )
+                expected = f"a policy's arrays ({', '.join(_ARRAYS)}) of F32 or F64"
+                raise InvalidFile(f"{path}: expected {expected}, got {listing[:400]}")
             arrays = {name: file.get_tensor(name) for name in kinds}
     except (SafetensorError, OSError, ValueError) as error:
         reason = str(error).removeprefix("Error while deserializing header: ")
-        raise InvalidFile(
-            f"{path}: expected a policy, as animat train writes it, got a file that cannot be read as one ({reason})"
-        ) from error
+        got = f"a file that cannot be read as one ({reason})"
+        raise InvalidFile(f"{path}: expected a policy, as animat train writes it, got {got}") from error
     with in_file(path):
         description = json_data(metadata["animat"], "metadata")
         file_format = description.get("format") if isinstance(description, dict) else description

@@ -69,9 +69,8 @@ class SAC:
 
     def __post_init__(self) -> None:
         if self.replay % self.environments:
-            raise InvalidArgument(
-                f"replay: expected a multiple of environments ({self.environments}), got {self.replay}"
-            )
+            n = self.environments
+            raise InvalidArgument(f"replay: expected a multiple of environments ({n}), got {self.replay}")
 
 
 class TrainingProvenance(TypedDict, total=False):

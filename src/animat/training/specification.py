@@ -136,9 +136,8 @@ class Training:
         if self.pulse_cost and self.mapping is None:
             raise InvalidArgument(f"pulse_cost: expected 0 without neurons, got {self.pulse_cost:g}")
         if self.pulse_cost and self.episodes_assessed:
-            raise InvalidArgument(
-                f"pulse_cost: expected 0 with assessments, which use the task's own return, got {self.pulse_cost:g}"
-            )
+            expected = "0 with assessments, which use the task's own return"
+            raise InvalidArgument(f"pulse_cost: expected {expected}, got {self.pulse_cost:g}")
         if self.shadowing == "drawn" and self.mapping is None:
             raise InvalidArgument("shadowing: expected a mapping with 'drawn', got none")
         if self.is_varied and isinstance(self.robot, HostRobot):

@@ -147,10 +147,9 @@ def expect_varied(robot: Robot[Any], varying: Varying) -> None:
         try:
             jax.eval_shape(lambda value, name=name: once(value, name), jnp.float32(getattr(without_goal(robot), name)))
         except (JAXTypeError, TypeError, ValueError, AttributeError) as error:
-            raise InvalidArgument(
-                f"lessons: parameters.{name}: expected a parameter that {robot.name} uses only in arithmetic, got one "
-                f"that must be known at compile time ({first_line(error)})"
-            ) from error
+            expected = f"a parameter that {robot.name} uses only in arithmetic"
+            got = f"one that must be known at compile time ({first_line(error)})"
+            raise InvalidArgument(f"lessons: parameters.{name}: expected {expected}, got {got}") from error
 
 
 def _started(robot: Robot[Any], state: Any, drawn: Mapping[str, Array]) -> Any:
