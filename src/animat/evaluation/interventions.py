@@ -71,6 +71,8 @@ class SwitchEffect:
 
     def to_text(self) -> str:
         """One line."""
+        if not self.episodes:
+            return f"no episode lasted longer than the {self.at} actions after which the goal is switched"
         after = "" if self.after is None else f", first at action {self.after:g} after the switch (median)"
         share = f"{100 * self.turned:.0f} % of {self.episodes} episodes"
         return f"goal switched after {self.at} actions: a different stimulus is chosen in {share}{after}"
