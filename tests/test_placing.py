@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
@@ -11,7 +13,9 @@ from animat.cli import main
 from animat.errors import InvalidFile
 from animat.recordings.conversion import Origin, convert_recording
 from animat.recordings.formats.nwb import write_nwb
+from animat.recordings.placing import placed_by_date
 from animat.recordings.reading import read_recordings
+from animat.recordings.recorded_culture import RecordedCulture
 from synthetic_recordings import synthetic_recording
 
 
@@ -30,12 +34,26 @@ def test_recordings_of_rigs_are_placed_by_their_dates(tmp_path: Path, capsys: py
     later = tmp_path / "later.nwb"
     convert_recording(undated, later, Origin(recorded_at="2024-05-31T06:12:30Z"), start_min=10.0)
     assert [each.start_min for each in read_recordings([first, later])] == [0.0, 10.0]
-    for others in ([first, undated], [first, first]):
-        with pytest.raises(InvalidFile, match=r"both start at 0 min; .* convert all with their dates"):
+    # A start that was stated is not replaced, nor is one recording made of two.
+    for others in ([first, undated], [first, second, later]):
+        with pytest.raises(InvalidFile, match=r"both start at 0 min; .* or with their dates and no starts"):
             read_recordings(others)
+    with pytest.raises(InvalidFile, match=r"z\.nwb: expected each recording once, got it twice"):
+        read_recordings([first, first])
+    # The clock of a device starts with each program.
+    device = RecordedCulture("maxone")
+    days = [(0.0, 9), (10.0, 10), (0.0, 33)]
+    series = [
+        replace(
+            recording, start_min=at, culture=device, recorded_at=datetime(2024, 5, 1, tzinfo=UTC) + timedelta(hours=h)
+        )
+        for at, h in days
+    ]
+    assert [each.start_min for each in placed_by_date(series)] == [0.0, 60.0, 1440.0]
     assert main(["inspect", str(first), str(second), "--out", str(tmp_path / "figures"), "--json"]) == 0
     *printed, last = capsys.readouterr().out.splitlines()
     assert f"  note     placed-by-date: {note}" in printed
     inspected = json.loads(last)
     assert [finding["name"] for finding in inspected["together"]] == ["placed-by-date"]
+    assert [each["start_min"] for each in inspected["recordings"]] == [0.0, 72.5]
     assert [Path(figure).name for figure in inspected["figures"]][-1] == "series-drift.png"

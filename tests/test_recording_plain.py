@@ -606,8 +606,10 @@ def test_recordings_with_the_same_start_and_empty_folders_are_refused(tmp_path: 
         with pytest.raises(InvalidArgument, match="recordings: expected files or folders, got 3"):
             read_recordings(wrong)  # type: ignore[arg-type]
     path = npz(tmp_path, **SPIKES, **STIMULI)
+    other = path.with_name("b.npz")
+    other.write_bytes(path.read_bytes())
     with pytest.raises(InvalidFile, match=r"both start at 0 min; leave one out"):
-        read_recordings([path, path])
+        read_recordings([path, other])
 
 
 # --- real recordings -------------------------------------------------------------------------------------------------

@@ -97,6 +97,8 @@ class Inspect(ResponseOptions):
             unusable = [each["name"] for each in inspected if each["verdict"] == "not usable"]
             results: dict[str, Any] = {"recordings": inspected, "unreadable": unreadable, "unusable": unusable}
             of_files = placed_by_date([responses for _, responses in series])
+            for each, responses in zip(inspected, of_files, strict=True):
+                each["start_min"] = responses.start_min
             placed = {finding for each in of_files for finding in each.findings if finding.name == "placed-by-date"}
             if together := [*placed, *unlike_finding(of_files), *series_findings(of_files)]:
                 print("\n".join(["all together:", *finding_lines(together)]), end="\n\n")

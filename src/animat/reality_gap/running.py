@@ -169,7 +169,7 @@ def run_policies(
         for message in warnings_once(findings):
             report(f"warning: {message}")
         report(f"each pulse: {loop.pulse}")
-        report(str(expected))
+        report(f"{'warning: ' if expected.budget_min < expected.settling_min else ''}{expected}")
     expect_writable(folder, room_bytes=expected.room_bytes)
     session = run_session(
         culture,

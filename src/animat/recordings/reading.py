@@ -159,11 +159,13 @@ def _in_order(files: list[Path], read_one: Callable[[Path], S]) -> list[S]:
     placed = placed_by_date([read_one(file) for file in files])
     read = sorted(zip(placed, files, strict=True), key=lambda pair: pair[0].start_min)
     for (earlier, file), (later, other) in pairwise(read):
+        if file == other:
+            raise InvalidFile(f"{file}: expected each recording once, got it twice")
         if earlier.start_min == later.start_min:
             raise InvalidFile(
                 f"{other}: expected recordings with different starts, but this one and {file} both start at "
-                f"{later.start_min:g} min; leave one out, or convert all with their dates (animat convert "
-                "--recorded-at) or starts (--start-min)"
+                f"{later.start_min:g} min; leave one out, or convert all with their starts (animat convert "
+                "--start-min), or with their dates and no starts (--recorded-at)"
             )
     return [recording for recording, _ in read]
 

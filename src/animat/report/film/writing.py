@@ -18,7 +18,7 @@ from animat.progress import Progress, Silent
 from animat.report.film.frame import HEIGHT_PX, WIDTH_PX, Frames, pictures_of
 from animat.report.film.scene import Scene
 from animat.robots.drawing import ACCENT, BODY, GOAL, GOAL_FILL, INK, RAIL, TRAIL
-from animat.writing import atomic_write
+from animat.writing import atomic_write, expect_writable
 
 FRAMES_PER_S = {".mp4": 25, ".gif": 10}
 """By the film's suffix."""
@@ -29,7 +29,7 @@ _ROBOTS = (ACCENT, BODY, GOAL, GOAL_FILL, INK, RAIL, TRAIL)
 
 
 def check_film(path: str | os.PathLike[str]) -> None:
-    """Raise InvalidArgument, before any work, for another suffix, or if a package that MP4 needs is not installed."""
+    """Refuse, before any work, another suffix, a missing package for MP4, and a folder that cannot be written to."""
     path = Path(path)
     if path.suffix.lower() not in FRAMES_PER_S:
         raise InvalidArgument(f"{path}: expected a film's name to end in .mp4 or .gif, got {path.suffix!r}")
@@ -40,6 +40,7 @@ def check_film(path: str | os.PathLike[str]) -> None:
             f"{path}: expected the package imageio-ffmpeg for an MP4, which is not installed: "
             f"{install_command('film')}, or end the name in .gif"
         )
+    expect_writable(path.parent)
 
 
 def write_film(scene: Scene, path: str | os.PathLike[str], progress: Progress | None = None) -> Path:

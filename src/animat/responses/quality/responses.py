@@ -275,7 +275,7 @@ def _difference(responses: Responses) -> Iterator[Finding]:
     if len(responses.conditions) == 1:
         message = (
             "there is only one condition, so an agent has nothing to choose: to train, sort the stimuli by "
-            "frequency, interval, electrode or pattern"
+            "frequency, interval, electrode or pattern (--conditions)"
         )
         yield Finding("one-condition", "warning", message, 1.0)
     if len(known) < 2:
