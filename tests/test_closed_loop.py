@@ -513,13 +513,15 @@ def test_a_budget_that_runs_out_in_the_warm_up_ends_the_session(tmp_path: Path) 
 def test_bursts_are_handled_as_chosen(tmp_path: Path) -> None:
     sessions = {}
     for how in ("use", "repeat", "skip"):
-        loop = loop_of(robot=Navigation(episode_limit=40), burst_threshold=0.95, on_burst=how, mapping=Linear())
+        # Every 37th response is a burst: that of the second episode is at its start.
+        loop = loop_of(robot=Navigation(episode_limit=36), burst_threshold=0.95, on_burst=how, mapping=Linear())
         with FakeCulture() as culture:
-            sessions[how] = run_session(culture, loop, [RANDOM], tmp_path / how, episodes=5)
+            sessions[how] = run_session(culture, loop, [RANDOM], tmp_path / how, episodes=4)
     for how, session in sessions.items():
         ticks = list(session.ticks)
         bursts = [i for i, tick in enumerate(ticks) if tick.is_burst]
         assert bursts, how
+        assert how == "repeat" or [ticks[i].iteration for i in bursts] == [0, 1, 2]
         for i in bursts:
             tick, after = ticks[i], ticks[i + 1 : i + 2]
             if how == "use":
@@ -532,8 +534,8 @@ def test_bursts_are_handled_as_chosen(tmp_path: Path) -> None:
                 assert (tick.command, tick.reward) == (None, None)
                 assert (after[0].iteration, after[0].delivered) == (tick.iteration, tick.delivered)
                 assert after[0].number == tick.number + 1
-    assert sum(episode.iterations for episode in sessions["repeat"].episodes) == 200
-    assert len(list(sessions["repeat"].ticks)) > 200
+    assert sum(episode.iterations for episode in sessions["repeat"].episodes) == 4 * 36
+    assert len(list(sessions["repeat"].ticks)) > 4 * 36
 
 
 def test_a_stimulus_is_repeated_at_most_so_often(tmp_path: Path) -> None:

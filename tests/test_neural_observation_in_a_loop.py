@@ -105,7 +105,8 @@ class Watching:
 
 @pytest.fixture(scope="module")
 def ran(tmp_path_factory: pytest.TempPathFactory, remembering: HistoryTracker) -> tuple[Session, Watching]:
-    watching, loop = Watching(), replace(loop_of(robot=SHORT, burst_threshold=0.95), remembering=remembering)
+    # Six pulses at 5 Hz last for a second, which is no rest.
+    watching, loop = Watching(), replace(loop_of(robot=SHORT, burst_threshold=0.95, pulses=6), remembering=remembering)
     agents = [Agent("watching", "sees", watching), Agent("random", "does not", AnyCondition(5))]
     with FakeCulture() as culture:
         return run_session(culture, loop, agents, tmp_path_factory.mktemp("loop"), episodes=4, seed=2), watching

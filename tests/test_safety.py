@@ -356,7 +356,8 @@ def test_only_what_time_makes_safe_is_waited_for(monkeypatch: pytest.MonkeyPatch
         ("interval_us", 5_000_000.0, None),
         ("gap_us", 100_000.0, 0.3 + BALANCED_PULSE.duration_us * 1e-6),
     ):
-        guard = Guard(replace(WIDE, **{limit: least_us}), SITES)
+        tighter: dict[str, Any] = {limit: least_us}
+        guard = Guard(replace(WIDE, **tighter), SITES)
         guard.admit([last], 0.0)
         with monkeypatch.context() as patched, pytest.raises(UnsafeStimulus, match="amplitude"):
             patched.setattr(guard, "check", check := Mock(wraps=guard.check))
