@@ -324,10 +324,14 @@ def test_an_experimenter_is_last_first(who: str) -> None:
     ],
 )
 def test_a_date_without_a_zone_is_taken_as_utc_with_a_note(date: str, is_noted: bool, tmp_path: Path) -> None:
-    written = convert_recording(rig_file("npz", tmp_path), tmp_path / "out.nwb", Origin(recorded_at=date))
+    origin = Origin(recorded_at=date, subject_id="c")
+    written = convert_recording(rig_file("npz", tmp_path), tmp_path / "out.nwb", origin, start_min=30.0)
     findings = {finding.name: finding for finding in written.findings}
     assert ("zone-unknown" in findings) == is_noted
     with h5py.File(tmp_path / "out.nwb") as file:
         assert ("+00:00" in file["session_start_time"][()].decode()) == (is_noted or date.endswith("Z"))
-    again = convert_recording(tmp_path / "out.nwb", tmp_path / "again.nwb")
+    again = convert_recording(tmp_path / "out.nwb", tmp_path / "again.nwb", start_min=0.0)
+    assert (written.start_min, again.start_min) == (30.0, 0.0)
+    # The culture has the name that was given.
+    assert written.culture is not None and written.culture == again.culture
     assert [finding.name for finding in again.findings] == [finding.name for finding in written.findings]
