@@ -115,10 +115,11 @@ def test_the_neurons_seen_are_those_of_the_episode_that_the_agent_acts_in() -> N
     assert seen[0] == seen[1]
     assert seen[0][-1][-2] != float(state.neurons[0])
     # When it ends, the other episode starts again.
-    iterations = [int(state.info["other_episode"].iteration)]
+    others: list[Any] = [state.info["other_episode"]]
     for i in range(3):
         state = environment.step(jax.random.key(i), state, jnp.int32(1), simulator)
-        iterations.append(int(state.info["other_episode"].iteration))
+        others.append(state.info["other_episode"])
+    iterations = [int(other.iteration) for other in others]
     assert 0 in iterations and all(after in (0, before + 1) for before, after in itertools.pairwise(iterations))
 
 
