@@ -282,7 +282,7 @@ def test_in_a_session_thresholds_move_after_every_response_that_counts(
         Agent("no", "", OneCondition(4), "silent"),
     ]
     with FakeCulture() as culture:
-        session = run_session(culture, loop, agents, tmp_path, episodes=6)
+        session = run_session(culture, loop, agents, tmp_path, episodes=4)
     adapted(session, recorded, adjusted, lambda tick: tick.agent in ("random", "shuffled"))
     assert_read_alike(tmp_path, loop)
     assert ("memory" in session.log.header["loop"]) and (session.log.header["loop"]["memory"]["load_s"] > 0) == (

@@ -539,6 +539,7 @@ def test_bursts_are_handled_as_chosen(tmp_path: Path) -> None:
     assert len(list(sessions["repeat"].ticks)) > 4 * 36
 
 
+@pytest.mark.oracle
 def test_a_task_that_ends_at_the_limit_is_not_cut_off_there(tmp_path: Path) -> None:
     limit = 200
     for ends in ("before the limit", "at the limit"):
