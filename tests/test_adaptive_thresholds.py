@@ -276,12 +276,14 @@ def test_in_a_session_thresholds_move_after_every_response_that_counts(
     loop = loop_of(percentiles=percentiles_of(adjusted), adaptive_from=adjusted, burst_threshold=0.95, pause_s=1.5)
     agents = [
         RANDOM,
+        # What was delivered counts, not what was chosen.
+        Agent("shuffled", "", OneCondition(4), "shuffled"),
         Agent("always", "", OneCondition(4), calibrates=False),
         Agent("no", "", OneCondition(4), "silent"),
     ]
     with FakeCulture() as culture:
-        session = run_session(culture, loop, agents, tmp_path, episodes=6)
-    adapted(session, recorded, adjusted, lambda tick: tick.agent == "random")
+        session = run_session(culture, loop, agents, tmp_path, episodes=4)
+    adapted(session, recorded, adjusted, lambda tick: tick.agent in ("random", "shuffled"))
     assert_read_alike(tmp_path, loop)
     assert ("memory" in session.log.header["loop"]) and (session.log.header["loop"]["memory"]["load_s"] > 0) == (
         memory is not None

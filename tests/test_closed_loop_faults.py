@@ -140,7 +140,7 @@ def spikes(change: Callable[[Any, Any], tuple[Any, Any]]) -> Callable[[Observed]
         (garbled(stimulus_time_s=lambda o: o.stimulus_time_s - 0.002), "2 ms before its requested time"),
         (garbled(duration_s=lambda o: 0.001), "returned 0.001 s"),
         pytest.param(garbled(duration_s=lambda o: float("nan")), "returned nan s", marks=pytest.mark.oracle),
-        (garbled(start_s=lambda o: 3.0), "went back"),
+        (garbled(start_s=lambda o: o.start_s - 0.002), "went back"),
         (lambda culture, observed: None, "cannot be read"),
     ],
 )

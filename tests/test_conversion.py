@@ -278,7 +278,8 @@ def test_stimuli_before_and_after_the_traces_of_a_reader_leave_spikes_where_they
         """As SpikeInterface has it."""
 
         get_channel_ids = staticmethod(lambda: [0, 1, 2])
-        has_probe = has_scaleable_traces = staticmethod(lambda: False)
+        has_probe, has_scaleable_traces = staticmethod(lambda: True), staticmethod(lambda: False)
+        get_channel_locations = staticmethod(lambda: [[1.0, 2.0, 0.0], [3.0, 4.0, 0.0], [5.0, 6.0, 0.0]])
         get_num_samples = staticmethod(lambda segment_index: len(voltage))
         get_sampling_frequency = staticmethod(lambda: 20_000.0)
         get_num_segments = staticmethod(lambda: 1)
@@ -287,7 +288,13 @@ def test_stimuli_before_and_after_the_traces_of_a_reader_leave_spikes_where_they
         def get_traces(segment_index: int, start_frame: int, end_frame: int, return_in_uV: bool) -> np.ndarray:
             return voltage[start_frame:end_frame] * 0.1
 
-    monkeypatch.setattr(with_spikeinterface, "_reader", lambda name: lambda path: Traces())
+    given: list[dict[str, bool]] = []
+
+    def read(path: Path, **options: bool) -> Traces:
+        given.append(options)
+        return Traces()
+
+    monkeypatch.setattr(with_spikeinterface, "_reader", lambda name: read)
     (tmp_path / "a.rhd").touch()
     (tmp_path / "a_stimuli.csv").write_text("-3.0\n1.5\n")
     recording = convert_recording(tmp_path / "a.rhd", tmp_path / "with.nwb", reader="intan")
@@ -296,6 +303,13 @@ def test_stimuli_before_and_after_the_traces_of_a_reader_leave_spikes_where_they
     assert len(without.spike_times_s) > 10 and (without.start_s, without.stop_s) == (0.0, 1.0)
     assert recording.spike_times_s.tolist() == without.spike_times_s.tolist()
     assert recording.start_s == -3.0 and recording.stop_s >= 1.5
+    assert (recording.channels.x_um.tolist(), recording.channels.y_um.tolist()) == ([1.0, 3.0, 5.0], [2.0, 4.0, 6.0])
+    # Nothing is installed behind the user's back.
+    with_spikeinterface.open_with_spikeinterface(tmp_path / "a.rhd", "maxwell")
+    assert given == [{}, {}, {"install_maxwell_plugin": False}]
+    monkeypatch.setattr(Traces, "get_num_segments", staticmethod(lambda: 2))
+    with pytest.raises(InvalidFile, match="expected one segment of traces, got 2"):
+        with_spikeinterface.open_with_spikeinterface(tmp_path / "a.rhd", "intan")
 
 
 @pytest.mark.parametrize(("age", "fits"), [("P40D/P42D", True), ("P6W/P42D", True), ("P42D/P40D", False),
@@ -325,12 +339,16 @@ def test_an_experimenter_is_last_first(who: str) -> None:
     ],
 )
 def test_a_date_without_a_zone_is_taken_as_utc_with_a_note(date: str, is_noted: bool, tmp_path: Path) -> None:
-    written = convert_recording(rig_file("npz", tmp_path), tmp_path / "out.nwb", Origin(recorded_at=date))
+    origin = Origin(recorded_at=date, subject_id="c")
+    written = convert_recording(rig_file("npz", tmp_path), tmp_path / "out.nwb", origin, start_min=30.0)
     findings = {finding.name: finding for finding in written.findings}
     assert ("zone-unknown" in findings) == is_noted
     with h5py.File(tmp_path / "out.nwb") as file:
         assert ("+00:00" in file["session_start_time"][()].decode()) == (is_noted or date.endswith("Z"))
-    again = convert_recording(tmp_path / "out.nwb", tmp_path / "again.nwb")
+    again = convert_recording(tmp_path / "out.nwb", tmp_path / "again.nwb", start_min=0.0)
+    assert (written.start_min, again.start_min) == (30.0, 0.0)
     with NWBHDF5IO(tmp_path / "again.nwb", "r") as io:
         assert again.recorded_at == written.recorded_at == io.read().session_start_time
+    # The culture has the name that was given.
+    assert written.culture is not None and written.culture == again.culture
     assert [finding.name for finding in again.findings] == [finding.name for finding in written.findings]

@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from animat.cultures.same_culture import other_culture
-from animat.cultures.series import STATE_FILE, record_series
+from animat.cultures.series import LONGEST_MIN, STATE_FILE, check_interval, minutes_of, record_series
 from animat.cultures.under_way import UNDER_WAY, PartialRecording
 from animat.cultures.virtual import VirtualCulture
 from animat.errors import InvalidArgument, InvalidFile, Mismatch, UnsafeStimulus
@@ -286,6 +286,10 @@ def test_an_interval_must_hold_a_recording(tmp_path: Path) -> None:
     with pytest.raises(InvalidArgument, match="make_culture: expected a function that returns a culture, such as"):
         record_series(small_culture(), SHORT, tmp_path)  # type: ignore[arg-type]
     assert not list(tmp_path.glob("*.nwb"))
+    # A single one has no next.
+    check_interval(SHORT, 1, 0.01)
+    check_interval(SHORT, 1, 2 * LONGEST_MIN)
+    check_interval(SHORT, 2, minutes_of(SHORT))
 
 
 def test_a_pulse_beyond_the_limits_is_refused_before_anything_is_written(tmp_path: Path) -> None:
@@ -334,6 +338,8 @@ def test_the_file_for_those_who_watch_leaves_its_room_to_the_recording(
     def followed(partial: PartialRecording, so_far: Callable[[], Recording]) -> None:
         follow(partial, so_far)
         during.append((tmp_path / UNDER_WAY).exists())
+        # Killed now, it would need no second scan.
+        during.append((tmp_path / STATE_FILE).exists())
 
     def written(recording: Recording, file: Path) -> None:
         before.append(list(tmp_path.glob(f"*{UNDER_WAY}*")))

@@ -24,6 +24,7 @@ from animat.recordings.detection.spikes import (
     find_negative_peaks,
     median_noise_uv,
 )
+from animat.recordings.formats.cl1_layout import SITES
 from animat.recordings.formats.hdf5_formats import open_traces
 from animat.recordings.raw import RawTraces, in_microvolts
 from animat.recordings.recording import Channels
@@ -508,6 +509,8 @@ def test_raw_traces_of_a_maxwell_file(tmp_path: Path) -> None:
     recording = read_traces(path, Detection())
     assert recording.channels.label.tolist() == ["9", "40", "3"]
     assert recording.channels.electrode.tolist() == [2000, 26_399, 1000]
+    # In microvolts.
+    np.testing.assert_allclose(open_traces(path)[0].read_uv(0, 9), 6.3 * raw[:, :9].T, rtol=1e-5)
     assert (recording.duration_s, len(recording.stimuli)) == (2.0, 1)
     found = DetectedSpikes(recording.spike_times_s, recording.spike_channels, np.empty(0), ())
     hit, missed, false = agreement(found, [at[np.abs(at - 10_000) > 60] for at in truth])
@@ -575,6 +578,9 @@ def test_raw_traces_of_a_cl1_file(tmp_path: Path) -> None:
     assert len(recording.channels) == 59
     assert len(recording.spike_times_s) > 60
     assert recording.stimuli.electrodes.tolist() == [[9]]
+    with h5py.File(path, "r+") as file:
+        file.attrs["uV_per_sample_unit"] = 0.25
+    np.testing.assert_allclose(open_traces(path)[0].read_uv(3, 9), 0.25 * voltage[3:9, list(SITES)], rtol=1e-5)
 
 
 def test_a_channel_that_is_saturated_most_of_the_time_is_not_taken_for_a_quiet_one() -> None:
@@ -692,6 +698,7 @@ def test_traces_that_begin_before_0_keep_stimuli_to_their_end(tmp_path: Path) ->
     write_stimuli(tmp_path / "a.nwb", [1.0, 4.9])
     recording = read_traces(tmp_path / "a.nwb", Detection())
     assert (recording.start_s, recording.duration_s) == (-1.0, 6.0)
+    np.testing.assert_allclose(open_traces(tmp_path / "a.nwb")[0].read_uv(0, 9), voltage[:9], rtol=1e-5)
     assert recording.stimuli.time_s.tolist() == [1.0, 4.9]
     # A duration that rounds to before the last stimulus.
     write_nwb_traces(tmp_path / "b.nwb", voltage, start_s=-1.6805853027283018)

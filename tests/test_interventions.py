@@ -147,6 +147,7 @@ def test_yoked_stimuli_are_those_of_the_episode_that_is_observed() -> None:
     # The two episodes are independent.
     here = np.asarray(traced.states.robot.goal * traced.states.robot.sensed)[:, :, :-1] > 0
     assert 0.4 < (here == agree).mean() < 0.6
+    assert 0.2 < (other.goal[..., 0] == traced.states.robot.goal[..., 0]).mean() < 0.8
 
 
 @pytest.mark.oracle

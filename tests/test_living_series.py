@@ -14,6 +14,7 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -49,7 +50,12 @@ def replay() -> ReplayCulture:
 
 def test_a_replay_is_recorded_at_its_minutes(tmp_path: Path) -> None:
     with replay() as culture:
-        series = record_series(lambda: culture, SHORT, tmp_path / "a", sessions=3, interval_min=2.0, seed=4)
+        series = record_series(
+            lambda: culture, SHORT, tmp_path / "a", sessions=3, interval_min=2.0, seed=4, progress=(seen := Mock())
+        )
+    done = [update.args[0] for update in seen.update.mock_calls]
+    # Two blocks a recording.
+    assert list(dict.fromkeys(done)) == [0.5, 1.0, 1.5, 2.0, 2.5, 3.0]
     assert [file.name for file in series.files] == [f"recording_{minute:04}_min.nwb" for minute in (0, 2, 4)]
     assert series.missed_min == []
     assert sorted(path.name for path in (tmp_path / "a").iterdir()) == [file.name for file in series.files]
@@ -63,18 +69,20 @@ def test_a_replay_is_recorded_at_its_minutes(tmp_path: Path) -> None:
 @pytest.mark.oracle
 def test_what_is_due_next_is_recorded_and_missed_recordings_are_listed(tmp_path: Path) -> None:
     with FakeCulture() as culture:
-        first = record_series(lambda: culture, SHORT, tmp_path, sessions=2, interval_min=1.0)
-        kept = [file.read_bytes() for file in first.files]
+        first = record_series(lambda: culture, SHORT, tmp_path, sessions=2, interval_min=2.0)
+        # The second alone says when the series began.
+        first.files[0].unlink()
+        kept = first.files[1].read_bytes()
         # Sessions 2 and 3 would have begun, and 3 be over, when the next is due.
-        culture.rest(150.0)
+        culture.rest(300.0)
         pulses = culture.pulses
-        series = record_series(lambda: culture, SHORT, tmp_path, sessions=6, interval_min=1.0)
-    assert series.missed_min == [2.0]
-    assert [file.name[10:14] for file in series.files] == ["0000", "0001", "0003", "0004", "0005"]
-    assert [file.read_bytes() for file in series.files[:2]] == kept
+        series = record_series(lambda: culture, SHORT, tmp_path, sessions=6, interval_min=2.0)
+    assert series.missed_min == [0.0, 4.0]
+    assert [file.name[10:14] for file in series.files] == ["0002", "0006", "0008", "0010"]
+    assert series.files[0].read_bytes() == kept
     minutes = [read_recording(file).start_min - 0.2 for file in series.files]
-    assert minutes[3:] == pytest.approx([4.0, 5.0])
-    assert 3.0 <= minutes[2] < 4.0
+    assert minutes[2:] == pytest.approx([8.0, 10.0])
+    assert 6.0 <= minutes[1] < 8.0
     assert culture.pulses == pulses + 3 * 10
 
 

@@ -87,16 +87,24 @@ def test_a_burst_of_the_culture_is_none_of_the_response_that_is_drawn_in_its_pla
         assert (tick["spikes"], tick["active_ratio"], tick["readout_hz"]) == (16, 1.0, ())
 
 
-def test_yoked_stimuli_are_those_of_a_policy_s_episode_before(session: Session) -> None:
-    of_policies = {e.number: [t.delivered for t in session.ticks if t.episode == e.number and t.iteration >= 0]
-                   for e in session.episodes if e.agent in POLICIES}  # fmt: skip
-    found = ticks_of(session, "yoked")
-    assert len(found) == 6
-    for ticks in found:
-        before = [number for number in of_policies if number < ticks[0].episode]
-        assert [tick.delivered for tick in ticks] == of_policies[max(before)]
-        assert all(tick.pulse_time_s for tick in ticks)
-    assert any(tick.delivered != tick.chosen for ticks in found for tick in ticks)
+def test_yoked_stimuli_are_those_of_a_policy_s_episode_before(session: Session, tmp_path: Path) -> None:
+    # A cartpole may stay upright for longer than in the episode that is repeated.
+    agents = [Agent("p0", "as trained", POLICIES["p0"]), *(a for a in changed(Cartpole()) if a.name == "yoked")]
+    with FakeCulture() as culture:
+        longer = run_session(culture, loop_of(robot=Cartpole()), agents, tmp_path, episodes=6, seed=1)
+    lengths = []
+    for each in (session, longer):
+        of_policies = {e.number: [t.delivered for t in each.ticks if t.episode == e.number and t.iteration >= 0]
+                       for e in each.episodes if e.agent in POLICIES}  # fmt: skip
+        found = ticks_of(each, "yoked")
+        assert len(found) == 6
+        for ticks in found:
+            source = of_policies[max(number for number in of_policies if number < ticks[0].episode)]
+            assert [tick.delivered for tick in ticks] == [source[i % len(source)] for i in range(len(ticks))]
+            assert all(tick.pulse_time_s for tick in ticks)
+            lengths.append((len(source), len(ticks), len({*source})))
+        assert any(tick.delivered != tick.chosen for ticks in found for tick in ticks)
+    assert any(ticks > source and conditions > 1 for source, ticks, conditions in lengths)
 
 
 def test_turned_round_every_command_is_the_opposite(session: Session) -> None:

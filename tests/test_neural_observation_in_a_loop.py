@@ -105,7 +105,8 @@ class Watching:
 
 @pytest.fixture(scope="module")
 def ran(tmp_path_factory: pytest.TempPathFactory, remembering: HistoryTracker) -> tuple[Session, Watching]:
-    watching, loop = Watching(), replace(loop_of(robot=SHORT, burst_threshold=0.95), remembering=remembering)
+    # Six pulses at 5 Hz last for a second, which is no rest.
+    watching, loop = Watching(), replace(loop_of(robot=SHORT, burst_threshold=0.95, pulses=6), remembering=remembering)
     agents = [Agent("watching", "sees", watching), Agent("random", "does not", AnyCondition(5))]
     with FakeCulture() as culture:
         return run_session(culture, loop, agents, tmp_path_factory.mktemp("loop"), episodes=4, seed=2), watching
@@ -119,12 +120,15 @@ def test_what_is_shown_follows_from_what_was_answered_before(
     trace = load = 0.0
     before_s, shown = -np.inf, iter(watching.shown)
     m, seen = MEMORY, 0
+    observed: tuple[float, ...] = ()
     for tick in session.ticks:
         if tick.agent == "watching" and tick.iteration >= 0:
             now = next(shown)
-            assert now.shape == (6,)
+            observed = session.episodes[tick.episode].start if tick.iteration == 0 else observed
+            np.testing.assert_array_equal(now[:-2], observed)
             np.testing.assert_allclose(now[-2:], (trace, load), atol=1e-12)
             seen += 1
+        observed = tick.observation
         first_s, last_s = tick.pulse_time_s[0], tick.read_after_s
         trace = 0.0 if first_s - before_s > 1.0 else trace
         load = load * np.exp((before_s - last_s) / m.load_s) + remembering.added

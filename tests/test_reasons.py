@@ -126,8 +126,9 @@ CASES: dict[str, tuple[dict[str, Any], str]] = {
         "the recording has few responses: 7 of 5 Hz",
     ),
     "lateness": (
-        {"late_s": lambda condition, _: np.where(condition == 1, 0.0026, 0.0)},
-        "pulses came late: 80 Hz in 100 % of its trials, by 2.6 ms of its 12.5 on average",
+        # Every second one.
+        {"late_s": lambda condition, _: 0.0026 * condition * (np.cumsum(condition) % 2)},
+        "pulses came late: 80 Hz in 50 % of its trials, by 2.6 ms of its 12.5 on average",
     ),
     "bursts": (
         {"is_burst": lambda *_: EVERY % 10 == 0},

@@ -19,7 +19,7 @@ from animat.errors import AnimatError, InvalidArgument, InvalidFile
 from animat.recordings.formats.npz import KEYS, OTHER_NAMES, ROUTING
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.quality import recording_findings
-from animat.recordings.reading import read_recording, read_recordings, read_source
+from animat.recordings.reading import list_recordings, read_recording, read_recordings, read_source
 from animat.recordings.recording import Recording
 from animat.stimulation.protocol import Presentation
 
@@ -50,7 +50,7 @@ def test_the_required_keys_are_enough(tmp_path: Path) -> None:
     assert np.isnan(recording.sampling_rate_hz)
     assert recording.presentation is None
     assert recording.stimuli.presentation.tolist() == [0, 1]
-    assert names(recording) >= {"unsorted-spikes", "unsorted-stimuli", "silent-channels-unknown"}
+    assert said(recording).keys() == {"unsorted-spikes", "unsorted-stimuli", "silent-channels-unknown"}
     early = "spikes that follow a later one in the file: 1 of 3; they were sorted by time"
     assert said(recording)["unsorted-spikes"] == early
 
@@ -77,6 +77,10 @@ def test_recordings_joined_in_one_file_cause_a_warning(tmp_path: Path) -> None:
     # Listed by channel, spikes go back too, and stimuli listed by condition, but hardly ever as often.
     for stimuli in (stimulus_s[0], stimulus_s[:2].ravel() + np.repeat([0, 0.5], 58)):
         assert "times-go-back" not in said(read_recording(npz(tmp_path, **joined, stimulus_time_s=stimuli)))
+    # Two events each that passed another on their way.
+    passed_s = np.arange(1, 59.0)
+    passed_s[[4, 9]] += 1.5
+    assert "times-go-back" not in said(read_recording(npz(tmp_path, **joined, stimulus_time_s=passed_s)))
 
 
 @pytest.mark.parametrize(
@@ -119,6 +123,8 @@ def test_every_key_is_read_into_its_field(tmp_path: Path) -> None:
             duration_s=5.0,
             presentation_order="mixed",
             presentation_pulses=2,
+            # Spikes count, which are more than their number.
+            response_count=np.zeros((2, 3)),
             note_of_mine=np.zeros(2),
         )
     )
@@ -162,6 +168,9 @@ def test_units_become_channels_with_the_electrode_at_their_position(tmp_path: Pa
     )
     assert recording.provenance["channels"] == "sorted units"
     assert recording.channels.electrode.tolist() == [12, -1]
+    with np.load(tmp_path / "a.npz") as arrays:
+        stated = read_recording(npz(tmp_path, **arrays, unit_electrode=np.array([7, 8])))
+    assert stated.channels.electrode.tolist() == [7, 8]
     assert recording.stimuli.pattern.tolist() == [1, 0]
     assert recording.provenance["patterns"] == "0: sensory, 1: train"
 
@@ -202,6 +211,7 @@ def test_the_order_of_spikes_and_stimuli_in_the_file_does_not_matter(
                 spike_channel=channels[order],
                 stimulus_time_s=stimuli,
                 stimulus_frequency_hz=20 + stimuli,
+                stimulus_presentation=3 + np.searchsorted(distinct, stimuli),
                 **columns,
             )
         )
@@ -211,6 +221,8 @@ def test_the_order_of_spikes_and_stimuli_in_the_file_does_not_matter(
     assert np.array_equal(first.spike_times_s, second.spike_times_s)
     assert np.array_equal(first.spike_channels, second.spike_channels)
     assert np.array_equal(second.stimuli.frequency_hz, 20 + distinct)
+    assert np.array_equal(second.stimuli.presentation, 3 + np.arange(len(distinct)))
+    assert "trials-unknown" not in said(second)
     assert (first.start_s, first.duration_s) == (second.start_s, second.duration_s)
 
 
@@ -380,11 +392,13 @@ def test_csv_with_a_header_or_a_bare_column_of_stimuli(tmp_path: Path) -> None:
     assert recording.start_min == 10.0
     assert "n, uV" in said(recording)["columns-left-out"]
     stimuli = (
-        "time_s;frequency_hz;pattern;electrodes;presentation\n0.1;5;left;12 13;0\n0.2;;right;14;0\n0.3;80;left;;1\n"
+        "time;time_s;frequency_hz;pattern;electrodes;presentation\n"
+        "100;0.1;5;left;12 13;0\n200;0.2;;right;14;0\n300;0.3;80;left;;1\n"
     )
     (tmp_path / "other.csv").write_text(stimuli)
     recording = read_recording(path, stimuli_path=tmp_path / "other.csv")
     np.testing.assert_array_equal(recording.stimuli.frequency_hz, [5.0, np.nan, 80.0])
+    assert recording.stimuli.time_s.tolist() == [0.1, 0.2, 0.3]
     assert recording.stimuli.pattern.tolist() == [0, 1, 0]
     assert recording.stimuli.electrodes.tolist() == [[12, 13], [14, -1], [-1, -1]]
     assert recording.stimuli.presentation.tolist() == [0, 0, 1]
@@ -414,7 +428,8 @@ def test_csv_may_be_gzipped_and_have_a_byte_order_mark_and_windows_lines(tmp_pat
 
 
 def test_spikes_without_stimuli_are_read_and_reported(tmp_path: Path) -> None:
-    recording = read_recording(csv(tmp_path, "time,channel\n0.5,1\n"))
+    # A spreadsheet ends lines with the separators of empty cells.
+    recording = read_recording(csv(tmp_path, "time,channel\n0.5,1,,\n"))
     assert len(recording.stimuli) == 0
     refusal = next(finding for finding in recording_findings(recording) if finding.name == "no-stimuli")
     assert refusal.severity == "refuse"
@@ -464,7 +479,7 @@ BAD_CSV = {
         "a_spikes.csv, line 3: spike_time_s: expected a number, got 'soon'",
     ),
     "an empty time": ("time,channel\n,2\n", None, "line 2: spike_time_s: expected a finite number, got an empty field"),
-    "an empty channel": ("time,channel\n1,\n1,2\n", None, "line 2: .*expected a channel for each spike, got 1 without"),
+    "an empty channel": ("time,channel\n1,2\n1,\n", None, "line 3: .*expected a channel for each spike, got 1 without"),
     "a short line": ("time,channel\n1,2\n1\n", None, "line 3: expected 2 fields, as in the header, got 1: is a field"),
     "a long line after a blank one": (
         "time,channel\n1,2\n\n1,2,3\n",
@@ -520,6 +535,11 @@ BAD_CSV = {
         "time,channel\n1,2\n",
         "time,frequency_hz\n1,-5\n",
         "a_stimuli.csv, line 2: .*positive frequencies .* got -5",
+    ),
+    "a frequency of 0": (
+        "time,channel\n1,2\n",
+        "time,frequency_hz\n1,5\n2,0\n",
+        "a_stimuli.csv, line 3: .*positive frequencies .* got 0",
     ),
 }
 
@@ -577,6 +597,9 @@ def test_files_that_are_not_recordings_are_refused_in_one_line(tmp_path: Path) -
         assert "\n" not in str(caught.value)
     with pytest.raises(InvalidArgument, match="start_min: expected finite minutes, got nan"):
         read_recording(tmp_path / "a.npy", start_min=float("nan"))
+    remedy = "name the file of stimuli NAME_stimuli.csv and that of spikes NAME_spikes.csv"
+    with pytest.raises(InvalidArgument, match=f"stimuli: expected only for HDF5 files, got 'x' for .*; {remedy}"):
+        read_recording(csv(tmp_path, "time,channel\n0.5,1\n"), stimuli="x")
     with pytest.raises(InvalidArgument, match="stimuli_path: expected only with CSV"):
         read_recording(npz(tmp_path, **SPIKES, **STIMULI), stimuli_path=tmp_path / "a_stimuli.csv")
 
@@ -595,6 +618,13 @@ def test_folders_are_read_in_the_order_of_the_cultures_clock(tmp_path: Path) -> 
     assert read[2].equals(first)
     first_alone = read_recordings([folder / "a.nwb"])
     assert first_alone[0].equals(first)
+
+
+def test_files_of_any_format_in_a_folder_are_listed_by_name(tmp_path: Path) -> None:
+    listed = ["a.h5", "b_responses.csv", "b_spikes.csv", "c_responses.csv.gz", "c_spikes.csv.gz", "d.npz", "e.nwb"]
+    for name in [*listed[::-1], ".f.nwb", "b_stimuli.csv", "d.csv", "notes.txt"]:
+        (tmp_path / name).touch()
+    assert [file.name for file in list_recordings(tmp_path)] == listed
 
 
 def test_recordings_with_the_same_start_and_empty_folders_are_refused(tmp_path: Path) -> None:
@@ -673,6 +703,8 @@ def test_pulses_per_trial_that_are_not_stated_are_those_of_the_usual_trial(tmp_p
     # Not a number between those of the trials.
     unlike = {"stimulus_presentation": np.repeat(np.arange(4), [1, 2, 4, 4])}
     assert read_recording(npz(tmp_path, **SPIKES, **times, **unlike)).presentation == Presentation("mixed", 4)
+    mostly_two = {"stimulus_presentation": np.repeat(np.arange(4), [2, 2, 3, 4])}
+    assert read_recording(npz(tmp_path, **SPIKES, **times, **mostly_two)).presentation == Presentation("mixed", 2)
 
 
 def test_text_labels_and_a_negative_duration_are_named_in_errors(tmp_path: Path) -> None:
@@ -680,5 +712,7 @@ def test_text_labels_and_a_negative_duration_are_named_in_errors(tmp_path: Path)
     numbers = {"spike_time_s": np.array([0.1, 0.2]), "spike_channel": np.array([17, 1])}
     with pytest.raises(InvalidFile, match="rows from 0 to 2, as these are numbers and channel_label is text, got 17"):
         read_recording(npz(tmp_path, **numbers, **STIMULI, **labels))
+    started = npz(tmp_path, spike_time_s=numbers["spike_time_s"], spike_channel=np.ones(2), **STIMULI, start_s=-1.0)
+    assert (read_recording(started).start_s, read_recording(started, start_s=0.0).start_s) == (-1.0, 0.0)
     with pytest.raises(InvalidFile, match=r"the latter 0 or more, got -0\.25 and -1"):
         read_recording(npz(tmp_path, **SPIKES, **STIMULI, duration_s=-1.0))

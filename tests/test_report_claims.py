@@ -41,7 +41,7 @@ from animat.studies.publishing import (
     _lead,
     _pictures,
 )
-from animat.studies.report_tables import comparisons_table, controllability_table
+from animat.studies.report_tables import comparisons_table, controllability_table, scores_table
 from animat.studies.results import write_typed
 from animat.studies.run import plan_study
 from animat.studies.source import Source
@@ -155,6 +155,12 @@ def test_an_outcome_that_does_not_hold_after_correction_says_so() -> None:
     shown = comparisons_table(rows)
     outcomes = [row[shown.head.index("outcome")] for row in shown.rows]
     assert outcomes == [SECOND, f"{SECOND}, not after correction", f"{FIRST}, not after correction", NONE]
+
+
+def test_an_interval_begins_with_its_lower_end() -> None:
+    empty: dict[str, Any] = {field.name: () for field in fields(Results)}
+    shown = scores_table(Results(**empty | {"scores": (SCORED,)}))
+    assert shown.rows[0][shown.head.index("interquartile mean")] == "96\u00a0[95,\u00a097]"
 
 
 def test_a_p_that_is_too_long_to_compute_is_not_called_exact() -> None:

@@ -44,16 +44,18 @@ def test_a_table_has_the_responses_of_the_recording_that_it_was_counted_in(
 ) -> None:
     window_ms = (3.0, 9.0)
     recording = synthetic_recording(3, patterns=8, channels=24)
-    values = counts_of(recording, window_ms) / (1.0 if kind == "count" else 0.006)
-    stimuli = recording.stimuli
+    # In any order of the file, times as text included.
+    order = np.random.default_rng(1).permutation(len(recording.stimuli))
+    values = counts_of(recording, window_ms)[order] / (1.0 if kind == "count" else 0.006)
+    time_s, frequency_hz = recording.stimuli.time_s[order], recording.stimuli.frequency_hz[order]
     if form == "npz":
         path = tmp_path / "a.npz"
-        named = {"stimulus_time_s": stimuli.time_s, "stimulus_frequency_hz": stimuli.frequency_hz}
+        named = {"stimulus_time_s": time_s, "stimulus_frequency_hz": frequency_hz}
         np.savez(path, **{f"response_{kind}": values}, **named, response_window_ms=window_ms, start_min=20)
     else:
         path = tmp_path / "a_responses.csv"
         lines = []
-        for t, f, row in zip(stimuli.time_s.tolist(), stimuli.frequency_hz.tolist(), values.tolist(), strict=True):
+        for t, f, row in zip(time_s.tolist(), frequency_hz.tolist(), values.tolist(), strict=True):
             if form == "wide":
                 lines.append(",".join(map(repr, [t, f, 3.0, 9.0, 20.0, *row])))
             else:

@@ -143,7 +143,7 @@ class Requests:
         if self.rng.random() < 0.8:
             return self.pick(
                 Pulse((Phase(375, amplitude_mv=-200), Phase(375, amplitude_mv=200))),
-                Pulse((Phase(375, amplitude_mv=-200), Phase(325, amplitude_mv=200))),
+                Pulse((Phase(375, amplitude_mv=-193.75), Phase(325, amplitude_mv=200))),
                 Pulse((Phase(500, amplitude_mv=-150), Phase(500, amplitude_mv=150))),
                 Pulse((Phase(100, amplitude_mv=-100),)),
             )
@@ -319,6 +319,7 @@ def test_rates_hold_across_requests_and_a_second_later_all_is_forgotten() -> Non
 def test_an_emergency_stop_refuses_everything_until_a_new_session() -> None:
     guard = Guard(WIDE, SITES)
     guard.stop("smoke")
+    guard.stop("later")
     with pytest.raises(UnsafeStimulus, match="stopped: an emergency stop is in force \\(smoke\\)"):
         guard.admit([one()], 0.0)
     assert guard.admit([], 0.0).stimuli == ()
@@ -349,8 +350,14 @@ def test_a_gap_of_more_than_a_second_does_not_keep_the_first_stimulus_waiting() 
 
 def test_only_what_time_makes_safe_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
     loud, last = one(Pulse((Phase(100, amplitude_mv=-401),))), one(time_s=0.2)
-    for interval_us, earliest_s in ((100_000.0, 0.3), (2_000_000.0, 2.2), (5_000_000.0, None)):
-        guard = Guard(replace(WIDE, interval_us=interval_us), SITES)
+    for limit, least_us, earliest_s in (
+        ("interval_us", 100_000.0, 0.3),
+        ("interval_us", 2_000_000.0, 2.2),
+        ("interval_us", 5_000_000.0, None),
+        ("gap_us", 100_000.0, 0.3 + BALANCED_PULSE.duration_us * 1e-6),
+    ):
+        tighter: dict[str, Any] = {limit: least_us}
+        guard = Guard(replace(WIDE, **tighter), SITES)
         guard.admit([last], 0.0)
         with monkeypatch.context() as patched, pytest.raises(UnsafeStimulus, match="amplitude"):
             patched.setattr(guard, "check", check := Mock(wraps=guard.check))
@@ -373,6 +380,9 @@ def test_limits_that_cannot_be_are_refused() -> None:
         replace(LIMITS, stimuli_per_s=7).check_within(LIMITS)
     with pytest.raises(InvalidArgument, match=r"limits.phase_us"):
         replace(LIMITS, phase_us=(50.0, 500.0)).check_within(LIMITS)
+    with pytest.raises(InvalidArgument, match=r"limits.amplitude_step: expected no looser than the device's 12.5"):
+        replace(DEVICE, amplitude_step=6.25).check_within(DEVICE)
+    replace(DEVICE, amplitude_step=0.0, phase_us=(500.0, 500.0)).check_within(DEVICE)
 
 
 @pytest.mark.parametrize(

@@ -37,7 +37,7 @@ from animat.studies.report_tables import optima_table
 from animat.studies.results import read_typed, write_table, write_typed
 from animat.studies.source import Source
 from animat.studies.specification import Arm, Compared, RobotSpec, Study, mapping_label
-from animat.studies.tabulating import References, Tabulate, _controls, _finite, _optimum_error, _scores
+from animat.studies.tabulating import References, Tabulate, _comparisons, _controls, _finite, _optimum_error, _scores
 from animat.studies.task import study_seed
 from animat.studies.training import TrainGroup
 from animat.training.policy import Policy, load_policies
@@ -187,6 +187,18 @@ def test_means_and_errors_of_arms_and_controls_are_those_counted_by_hand(tmp_pat
     scored = {row.control: row.normalised_score for row in _controls(known) if row.optimum == 20.0}
     assert scored == {"trained: 1-threshold": pytest.approx(9 / 25), "random": 0.0, "constant": pytest.approx(12 / 25)}
     assert {row.normalised_score for row in _controls(known) if row.optimum is None} == {None}
+    compared = replace(study, comparisons=(Compared("learned", "control", "1-threshold"),))
+    (row,) = _comparisons(compared, 0.0, [known])
+    assert (row.random_second, row.optimum_first, row.optimum_second) == (-5.0, None, 20.0)
+    assert row.score_first is None and row.score_second == pytest.approx(9 / 25)
+    # Of four policies the middle half counts.
+    apart = episodes_of(np.array([[0.0], [0.0], [0.0], [100.0]]))
+    skewed = episode_rows(apart, robot="cartpole", arm="1-threshold", agent="policy", at_min=0.0)
+    score = next(_scores(References(study, tmp_path, spec, pd.concat([skewed, *of_one[1:]])), 0.0, 0.0))
+    assert (score.mean_return, score.interquartile_mean) == (25.0, 0.0)
+    # Where nothing can be learned, no return has a score.
+    write_typed(optima_file(tmp_path, "cartpole"), [replace(optimum, best_return=-5.0)])
+    assert References(study, tmp_path, spec, known.table).score(arms[0], 0.0, 4.0) is None
     # Its controller misses the value by more than the grid's error; without a grid there is neither.
     errors = [_optimum_error(each) for each in (optimum, replace(optimum, monte_carlo=20.1), None)]
     assert errors == [5.0, 0.5, None] and _optimum_error(replace(optimum, grid_error=None)) is None

@@ -116,7 +116,10 @@ def test_a_failed_recording_leaves_nothing_and_a_killed_one_is_shown_as_interrup
     with FakeCulture() as culture:
         recording = culture.record(SHORT, 1)
     PartialRecording(tmp_path)(lambda: recording)
-    assert read_recording(tmp_path / UNDER_WAY).spike_times_s.tolist() == recording.spike_times_s.tolist()
+    shown = read_recording(tmp_path / UNDER_WAY)
+    assert shown.spike_times_s.tolist() == recording.spike_times_s.tolist()
+    for name in ("label", "electrode", "x_um", "y_um"):
+        assert getattr(shown.channels, name).tolist() == getattr(recording.channels, name).tolist()
     found = RecordingView(tmp_path).view(None, 1.0)
     assert found["state"] == "silent"
     assert "was interrupted" in found["message"]

@@ -71,11 +71,18 @@ def test_shuffled_delivery_draws_every_condition_as_often_and_changes_nothing_el
     assert stats.chisquare(table.ravel()).pvalue > 1e-3
     for one, other in zip(*map(jax.tree.leaves, (after, every(uniforms, delivered, ANIMAT))), strict=True):
         np.testing.assert_array_equal(one, other)
-    # What neurons answer does not go with what was drawn for them.
+    # For robots that are stepped outside JAX, too.
+    for u, a, of in zip(uniforms[:3], chosen, delivered, strict=False):
+        both = shuffled.respond(u, state, a, simulator), ANIMAT.respond(u, state, jnp.int32(of), simulator)
+        for one, other in zip(*map(jax.tree.leaves, both), strict=True):
+            np.testing.assert_array_equal(one, other)
+    # Neither what neurons answer nor the robot's noise goes with what was drawn for them.
     anew = every(jax.random.uniform(jax.random.key(4), uniforms.shape), delivered, ANIMAT)
     for i in range(5):
         answers = (np.asarray(each.info["rate_hz"])[delivered == i] for each in (after, anew))
         assert stats.ks_2samp(*answers).pvalue > 1e-3
+        moved = (np.asarray(jax.vmap(ANIMAT.robot.observe)(each.robot))[delivered == i, 1] for each in (after, anew))
+        assert stats.ks_2samp(*moved).pvalue > 1e-3
 
 
 def test_wrappers_go_together_in_any_order() -> None:
@@ -107,6 +114,13 @@ def test_the_neurons_seen_are_those_of_the_episode_that_the_agent_acts_in() -> N
         seen.append(observations)
     assert seen[0] == seen[1]
     assert seen[0][-1][-2] != float(state.neurons[0])
+    # When it ends, the other episode starts again.
+    others: list[Any] = [state.info["other_episode"]]
+    for i in range(3):
+        state = environment.step(jax.random.key(i), state, jnp.int32(1), simulator)
+        others.append(state.info["other_episode"])
+    iterations = [int(other.iteration) for other in others]
+    assert 0 in iterations and all(after in (0, before + 1) for before, after in itertools.pairwise(iterations))
 
 
 @dataclass(frozen=True)
