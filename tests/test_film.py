@@ -264,7 +264,12 @@ def test_what_cannot_be_filmed_is_an_error_in_one_line_and_leaves_nothing(
         ("got no such file", tmp_path / "nowhere", "--out", out),
         ("expected at least one episode, got none", begun, "--out", out),
         ("expected a film's name to end in .mp4 or .gif, got '.avi'", folder, "--out", tmp_path / "film.avi"),
-        (f"{LOG_FILE}: expected a folder, got a file; choose another --out", folder, "--out", folder / LOG_FILE / "film.gif"),
+        (
+            f"{LOG_FILE}: expected a folder, got a file; choose another --out",
+            folder,
+            "--out",
+            folder / LOG_FILE / "film.gif",
+        ),
         ("begins within the session's", folder, "--out", out, "--span-s", 1000, 1001),
         ("expected a start from 0 s and a later end", folder, "--out", out, "--span-s", 2, 1),
         ("--recordings: expected none with a session", folder, "--out", out, "--recordings", folder),
