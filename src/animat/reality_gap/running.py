@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any
 
@@ -147,18 +148,20 @@ def run_policies(
     of_each = planned_episodes(len(policies), len(controls), episodes)
     check_session(culture, loop, agents, of_each, seed)
 
-    predicted = predict(
-        trained,
-        tuple(policies),
-        controls,
-        environment,
-        # Fixed thresholds stay the same in bootstraps; adaptive ones would adapt to their responses.
-        calibration if calibration.adaptive else calibration.with_percentiles(simulator.percentiles),
-        seed=seed,
-        progress=in_phase(progress, "predicting"),
-    )
-    # Before the session, as a loop must not wait for a core.
-    optimum, why_none = _optimal_return(animat, calibration, progress)
+    # The optimal return meanwhile, on another core: a session must not wait for one.
+    with ThreadPoolExecutor(1) as thread:
+        computed = thread.submit(_optimal_return, animat, calibration)
+        predicted = predict(
+            trained,
+            tuple(policies),
+            controls,
+            environment,
+            # Fixed thresholds stay the same in bootstraps; adaptive ones would adapt to their responses.
+            calibration if calibration.adaptive else calibration.with_percentiles(simulator.percentiles),
+            seed=seed,
+            progress=in_phase(progress, "predicting"),
+        )
+    optimum, why_none = computed.result()
     plan = [
         (n, predicted[each.name].presented, each.delivery != "silent") for n, each in zip(of_each, agents, strict=True)
     ]
@@ -243,15 +246,12 @@ def planned_episodes(policies: int, controls: int, episodes: int) -> list[int]:
     return [episodes] * policies + [min(episodes, of_a_control)] * controls
 
 
-def _optimal_return(
-    environment: Animat[Any], calibration: Calibration, progress: Progress | None
-) -> tuple[float | None, tuple[Finding, ...]]:
+def _optimal_return(environment: Animat[Any], calibration: Calibration) -> tuple[float | None, tuple[Finding, ...]]:
     """The optimal return on the recording's simulator, or a finding that says why there is none."""
     robot, reason = environment.robot, why_no_grid(environment.robot)
     if few := too_few(calibration.conditions, [len(responses) for responses in calibration.responses_hz]):
         reason = f"these conditions have too few responses: {', '.join(few)}"
     if reason is None:
-        in_phase(progress, "optimal return").update(0, 1, "computing it on the simulator")
         try:
             # Only the value, which is reported as "about": its uncertainty would take a third longer.
             case = environment, calibration.simulator
