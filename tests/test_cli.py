@@ -945,8 +945,8 @@ def test_a_warning_about_many_recordings_is_printed_once(capsys: pytest.CaptureF
     found = [Finding("binning", "warning", f"at {m} min: lost", m / 100) for m in (0, 20, 10)]
     print_warnings([*found, Finding("bursts", "note", "a few"), Finding("few-samples", "warning", "12 only", 12.0)])
     assert capsys.readouterr().err.splitlines() == [
-        "warning: at 20 min: lost (and 2 more like it)",
-        "warning: 12 only",
+        "warning: binning: at 20 min: lost (and 2 more like it)",
+        "warning: few-samples: 12 only",
     ]
 
 
@@ -958,7 +958,7 @@ def test_the_worst_of_several_warnings_is_printed(
     name: str, values: tuple[float, ...], worst: float, capsys: pytest.CaptureFixture[str]
 ) -> None:
     print_warnings([Finding(name, "warning", f"it is {value}", value) for value in values])
-    assert capsys.readouterr().err.startswith(f"warning: it is {worst} (and ")
+    assert capsys.readouterr().err.startswith(f"warning: {name}: it is {worst} (and ")
 
 
 def test_the_version_is_printed(capsys: pytest.CaptureFixture[str]) -> None:

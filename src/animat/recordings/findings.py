@@ -78,7 +78,7 @@ def merged(findings: Iterable[Finding]) -> tuple[Finding, ...]:
 
 
 def warnings_once(findings: Sequence[Finding]) -> Iterator[str]:
-    """The messages of all but notes; if several recordings have the same finding, its worst, with how many others."""
+    """Name and message of all but notes; if several recordings have the same one, its worst, with how many others."""
     warnings: dict[str, list[Finding]] = {}
     for finding in findings:
         if finding.severity != "note":
@@ -87,4 +87,4 @@ def warnings_once(findings: Sequence[Finding]) -> Iterator[str]:
         # The value farthest from 0, or the nearest where small values are bad.
         sizes = [abs(finding.value or 0.0) for finding in same]
         worst = same[sizes.index(min(sizes) if name in _FEW_IS_BAD else max(sizes))]
-        yield worst.message + (f" (and {len(same) - 1} more like it)" if len(same) > 1 else "")
+        yield f"{name}: {worst.message}" + (f" (and {len(same) - 1} more like it)" if len(same) > 1 else "")
