@@ -174,7 +174,9 @@ def check_at_once(name: str, episodes: int, n_actors: int) -> None:
 
 
 def networks_of(policies: Sequence[Policy], *, greedy: bool = False) -> Networks:
-    """Stack the networks of policies, at least one; raises InvalidArgument if their shapes differ."""
+    """Stack the networks of policies; raises InvalidArgument if there are none, or their shapes differ."""
+    if not policies:
+        raise InvalidArgument("policies: expected at least one, got none")
     if len({tuple(w.shape for w in policy.weights) for policy in policies}) > 1:
         raise InvalidArgument("policies: expected networks of one shape, got several: evaluate them one by one")
     layers = (

@@ -110,10 +110,12 @@ def p_of_u(u: float, n_first: int, n_second: int) -> float:
         z = (|U - m| - 1/2) / s,    m = n_1 n_2 / 2,    s^2 = n_1 n_2 (n_1 + n_2 + 1) / 12,
         p = min(1, 2 (1 - Phi(z)))
 
-    Refuses a U that is impossible for groups of these sizes (InvalidArgument); neither is empty.
+    Refuses an empty group, and a U that is impossible for groups of these sizes (InvalidArgument).
     """
     from scipy.stats import norm
 
+    if n_first < 1 or n_second < 1:
+        raise InvalidArgument(f"n: expected at least 1 sample in each group, got {n_first} and {n_second}")
     total = n_first * n_second
     if not 0 <= u <= total:
         raise InvalidArgument(f"u: expected 0 to {total} for {n_first} and {n_second} samples, got {u:g}")

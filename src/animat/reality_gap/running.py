@@ -149,8 +149,9 @@ def run_policies(
     check_session(culture, loop, agents, of_each, seed)
 
     # The optimal return meanwhile, on another core: a session must not wait for one.
-    with ThreadPoolExecutor(1) as thread:
-        computed = thread.submit(_optimal_return, animat, calibration)
+    thread = ThreadPoolExecutor(1)
+    computed = thread.submit(_optimal_return, animat, calibration)
+    try:
         predicted = predict(
             trained,
             tuple(policies),
@@ -161,6 +162,10 @@ def run_policies(
             seed=seed,
             progress=in_phase(progress, "predicting"),
         )
+    except Exception:
+        # A program that exits while JAX computes is killed by a signal. A user who interrupts does not wait.
+        thread.shutdown()
+        raise
     optimum, why_none = computed.result()
     plan = [
         (n, predicted[each.name].presented, each.delivery != "silent") for n, each in zip(of_each, agents, strict=True)

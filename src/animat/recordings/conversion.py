@@ -75,7 +75,10 @@ class Origin:
             ),
             "age": (_lengths_s, "an ISO 8601 duration such as P42D (days), P6W or P3M"),
             "experimenter": (PERSONS.fullmatch, "Last, First, several separated by semicolons"),
-            "recorded_at": (_date, "an ISO 8601 date such as 2024-05-31T14:00:00+09:00"),
+            "recorded_at": (
+                lambda text: date_of({"recorded_at": text}),
+                "an ISO 8601 date such as 2024-05-31T14:00:00+09:00",
+            ),
         }
         for name, (read, expected) in checks.items():
             if (text := getattr(self, name)) is not None and not read(text):
@@ -156,18 +159,11 @@ def _lengths_s(age: str) -> list[float]:
     return lengths_s
 
 
-def _date(text: str) -> datetime | None:
-    try:
-        return datetime.fromisoformat(text)
-    except ValueError:
-        return None
-
-
 def _without_zone(recording: Recording) -> Iterator[Finding]:
     """A note on a date without a time zone."""
     recorded_at = recording.provenance.get("recorded_at", "")
     is_noted = any(finding.name == "zone-unknown" for finding in recording.findings)
-    if (date := _date(recorded_at)) is not None and date.tzinfo is None and not is_noted:
+    if recording.recorded_at and datetime.fromisoformat(recorded_at).tzinfo is None and not is_noted:
         message = f"recorded_at {recorded_at} has no time zone and is taken as UTC; add one, such as +09:00"
         yield Finding("zone-unknown", "note", message)
 
