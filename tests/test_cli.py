@@ -497,7 +497,7 @@ BAD = {
     "a finding of another name": (
         nothing,
         [*TRAIN, "{recordings}", "--allow", "dead-windows"],
-        ["allow", "dead-window,", "'dead-windows'"],
+        ["allow", "dead-window,", "'dead-windows'; did you mean dead-window?"],
     ),
     "no workers, before recordings are read": (nothing, [*TRAIN, "{folder}/none", "--workers", "-2"], ["--workers"]),
     "no iterations, before recordings are read": (

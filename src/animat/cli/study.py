@@ -83,8 +83,8 @@ def _run_many(study: Study, base: Path, command: JobOptions) -> dict[str, Any]:
     report = write_cultures_page(study, results)
     cells = []
     for row in results.summary:
-        interval = "" if row.low_95 is None else f"{row.low_95:+.1f} to {row.high_95:+.1f}"
-        means = f"{row.mean_first:.1f}", f"{row.mean_second:.1f}", f"{row.difference:+.1f}"
+        interval = "" if row.low_95 is None else f"{row.low_95:+z.1f} to {row.high_95:+z.1f}"
+        means = f"{row.mean_first:.1f}", f"{row.mean_second:.1f}", f"{row.difference:+z.1f}"
         counts = f"{row.larger_in} of {row.cultures}", row.found_better
         cells.append([f"{row.robot}, {row.comparison}", *means, interval, *counts])
     if cells:

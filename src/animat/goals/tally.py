@@ -69,7 +69,7 @@ def cells_of(means: Mapping[str, Any]) -> list[str]:
     if not means:
         return [""] * len(MEANS)
     satisfied = f"{np.mean(means['satisfaction_percent']):.0f} %"
-    return [f"{100 * means['success_share']:.0f} %", satisfied, f"{means['margin']:+.2f}"]
+    return [f"{100 * means['success_share']:.0f} %", satisfied, f"{means['margin']:+z.2f}"]
 
 
 def satisfaction_line(objectives: Sequence[str], means: Mapping[str, Any]) -> str:

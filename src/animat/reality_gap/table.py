@@ -143,8 +143,8 @@ class RealityGap:
             fields, prediction = row.to_dict(), row.prediction
             measured = ["-", "-", ""]
             if (gap := fields["gap"]) is not None:
-                ends = "unknown" if gap["low"] is None else f"{gap['low']:+.1f} to {gap['high']:+.1f}"
-                measured = [f"{fields['measured']:.1f}", f"{gap['value']:+.1f}", ends]
+                ends = "unknown" if gap["low"] is None else f"{gap['low']:+z.1f} to {gap['high']:+z.1f}"
+                measured = [f"{fields['measured']:.1f}", f"{gap['value']:+z.1f}", ends]
             p = "" if row.comparison is None else f"{row.comparison.p:.2g}"
             counts = [
                 *(cells_of(row.met) if objectives else []),
@@ -167,7 +167,7 @@ class RealityGap:
         if self.optimum is not None:
             share = ""
             if self.gap_share is not None:
-                share = f"; the policies' gap is {100 * self.gap_share:+.0f} % of the range from random to it"
+                share = f"; the policies' gap is {100 * self.gap_share:+z.0f} % of the range from random to it"
             lines.append(f"  the optimal return on this simulator is about {self.optimum:.1f}{share}")
         if cost:
             ignores = "" if self.optimum is None else "; the optimal return ignores the cost"

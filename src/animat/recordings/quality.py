@@ -54,7 +54,7 @@ def _in_data(recording: Recording) -> Iterable[Finding]:
     yield from _duplicates(recording)
     yield from _stimulus_rows(recording)
     if unknown := int(np.count_nonzero(np.all(stimuli.electrodes == UNKNOWN, axis=1) & ~stimuli.is_rest)):
-        message = f"the electrodes of {unknown:,} of {len(stimuli):,} stimuli are not known"
+        message = f"the electrodes of {unknown:,} of {len(stimuli):,} stimuli are not known; a replay needs them"
         yield Finding("stimulus-electrodes-unknown", "note", message, float(unknown))
     if len(stimuli) and recording.presentation is None:
         how = "how the stimuli were presented (blocked or mixed, pulses per trial)"

@@ -24,7 +24,7 @@ def validation_text(name: str, validation: Validation) -> str:
     lines = [
         f"{name}: {v.verdict}",
         f"  fitted to {sum(v.n_fitted):,} responses of the first half, scored on {sum(v.n_held):,} of the second"
-        + ("" if np.isnan(v.drift) else f"; medians moved by {100 * v.drift:+.0f} %"),
+        + ("" if np.isnan(v.drift) else f"; medians moved by {100 * v.drift:+z.0f} %"),
         "",
     ]
     cells = []

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from animat.arguments import checked_arguments
-from animat.errors import InvalidArgument, Mismatch, UnusableData, in_min
+from animat.errors import InvalidArgument, Mismatch, UnusableData, did_you_mean, in_min
 from animat.recordings.findings import Finding
 from animat.recordings.quality import recording_findings
 from animat.recordings.recording import Recording, ResponseTable
@@ -221,4 +221,6 @@ def check_allowed(names: Sequence[str]) -> None:
     """Raise InvalidArgument unless all are names of refusing findings: a misspelt one would have no effect."""
     for name in names:
         if name not in REFUSING:
-            raise InvalidArgument(f"allow: expected findings among {', '.join(REFUSING)}, got {name!r}")
+            raise InvalidArgument(
+                f"allow: expected findings among {', '.join(REFUSING)}, got {name!r}{did_you_mean(name, REFUSING)}"
+            )

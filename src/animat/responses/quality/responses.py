@@ -248,7 +248,7 @@ def _bursts(responses: Responses, bursts: BurstSeparation) -> Iterator[Finding]:
             why = f"as one of two groups would have fewer than {LEAST_RESPONSES}"
         message = (
             f"no response is set apart as a burst, {why}: Otsu's threshold, {bursts.rejected:.3f}, would set apart "
-            f"{above} of {n} responses ({values})"
+            f"{above:,} of {n:,} responses ({values})"
         )
         yield Finding("bursts-not-separable", "note", message, bursts.separability)
     if not n_bursts:
@@ -286,8 +286,8 @@ def _difference(responses: Responses) -> Iterator[Finding]:
     differ = "hardly differ" if spread < SMALL_DIFFERENCE else f"differ by {spread:.2f} at most"
     message = (
         f"the conditions {differ} in P(x >= P50): {listed}; with one threshold the choice of a condition moves the "
-        f"mean command from {2 * lowest - 1:+.2f} to {2 * highest - 1:+.2f} on a scale from -1 to +1, and the rest is "
-        "chance"
+        f"mean command from {2 * lowest - 1:+z.2f} to {2 * highest - 1:+z.2f} on a scale from -1 to +1, and the rest "
+        "is chance"
     )
     if spread < SMALL_DIFFERENCE:
         message += ", so no policy can steer a robot much better than at random: stimulate in ways that differ more"
@@ -317,7 +317,7 @@ def _readouts(responses: Responses) -> Iterator[Finding]:
         low, high = int(apart.argmin()), int(apart.argmax())
         spread = float(apart[high] - apart[low])
         if spread - 2 * math.hypot(errors[low], errors[high]) < LITTLE_DIFFERENCE:
-            ends = (f"{apart[end]:+.2f} ({conditions[enough[end]].label})" for end in (low, high))
+            ends = (f"{apart[end]:+z.2f} ({conditions[enough[end]].label})" for end in (low, high))
             alike.append((spread, f"{names[a]} and {names[b]}", " to ".join(ends)))
     if alike:
         spread, pair, between = min(alike)
