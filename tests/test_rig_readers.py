@@ -725,6 +725,41 @@ def write_trials(path: Path, electrodes: list[Any] | None, stimuli: bool = False
     return path
 
 
+def write_onsets(path: Path, onset_s: list[float], name: str = "stim_onset_time") -> Path:
+    import pynwb
+
+    start = datetime.datetime(2024, 1, 1, tzinfo=datetime.UTC)
+    nwb = pynwb.NWBFile(session_description="x", identifier="x", session_start_time=start)
+    nwb.add_unit(spike_times=[0.1, 5.5, 9.9])
+    nwb.add_trial_column(name, "in s")
+    nwb.add_trial_column("stim_frequency", "in Hz")
+    for i, onset in enumerate(onset_s):
+        nwb.add_trial(start_time=2.0 * i, stop_time=2.0 * i + 1.5, **{name: onset, "stim_frequency": 5.0 + i})
+    with pynwb.NWBHDF5IO(str(path), "w") as nwb_io:
+        nwb_io.write(nwb)
+    return path
+
+
+@pytest.mark.parametrize("name", ["stim_onset_time", "stimulus_start", "stimOnTimes"])
+def test_stimuli_of_trials_begin_where_a_column_says(name: str, tmp_path: Path) -> None:
+    recording = read_recording(write_onsets(tmp_path / "a.nwb", [0.5, np.nan, 4.75, 7.5], name))
+    assert recording.stimuli.time_s.tolist() == [0.5, 4.75, 7.5]
+    assert recording.stimuli.frequency_hz.tolist() == [5.0, 7.0, 8.0]
+    assert found(recording)["stimuli-from"] == (
+        f"3 stimuli are taken from /intervals/trials/{name}; 1 of 4 rows have none"
+    )
+    assert "columns-left-out" not in found(recording)
+
+
+@pytest.mark.parametrize("onset_s", [[0.5, 0.5, 0.5, 0.5], [500.0, 2500.0, 4500.0, 6500.0], [np.nan] * 4])
+def test_times_of_stimuli_outside_their_trials_are_not_taken(onset_s: list[float], tmp_path: Path) -> None:
+    path = write_onsets(tmp_path / "a.nwb", onset_s)
+    assert "stimuli-elsewhere" in found(read_recording(path))
+    recording = read_recording(path, stimuli="trials")
+    assert recording.stimuli.time_s.tolist() == [0.0, 2.0, 4.0, 6.0]
+    assert "stim_onset_time" in found(recording)["columns-left-out"]
+
+
 def test_nothing_is_known_after_a_cl1s_index_repeats_itself(tmp_path: Path) -> None:
     said = [packed_text(json.dumps({"frequency_hz": hz, "pattern": n})) for n, hz in enumerate((5.0, 10.0, 20.0, 40.0))]
     frames = (1000, 2000, 3000, 4000)

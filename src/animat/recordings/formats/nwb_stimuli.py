@@ -28,6 +28,8 @@ COLUMNS = {
 }
 NO_STIMULUS_COLUMNS = ("id", "start_time", "stop_time", "tags", "timeseries")
 """Columns that any table of intervals may have."""
+ONSET_NAME = re.compile(r"stim(ulus)?_?(on|onset|start)(_?times?)?", re.IGNORECASE)
+"""A column of the times at which the stimuli of trials begin, which is later than the trials themselves."""
 APART_S = 0.001
 _BLOCK = 2**20
 
@@ -41,9 +43,15 @@ def read_stimuli(file: Hdf5File, asked: str | None, findings: list[Finding]) -> 
     if at is None:
         return {"stimulus_time_s": np.empty(0)}
     is_table = file.has(f"{at}/start_time")
-    columns = _of_intervals(file, at, findings) if is_table else {"stimulus_time_s": _of_series(file, at)}
+    onset = _onset_column(file, at) if is_table else None
+    columns = _of_intervals(file, at, onset, findings) if is_table else {"stimulus_time_s": _of_series(file, at)}
+    n_rows, source = len(columns["stimulus_time_s"]), at
+    if onset is not None:
+        has_one = np.isfinite(columns["stimulus_time_s"])
+        columns, source = {name: values[has_one] for name, values in columns.items()}, f"{at}/{onset}"
     n = len(columns["stimulus_time_s"])
-    findings.append(Finding("stimuli-from", "note", f"{n:,} stimuli are taken from /{at}", float(n)))
+    without = f"; {n_rows - n:,} of {n_rows:,} rows have none" if n < n_rows else ""
+    findings.append(Finding("stimuli-from", "note", f"{n:,} stimuli are taken from /{source}{without}", float(n)))
     return columns
 
 
@@ -59,7 +67,8 @@ def _place(file: Hdf5File, asked: str | None, findings: list[Finding]) -> str | 
         if not named:
             choose(f"{file.path}: stimuli", "--stimuli", every or ["none (nothing in the file can be stimuli)"], asked)
         return choose(f"{file.path}: stimuli named {asked}", "--stimuli", named, None)
-    candidates = first or [at for at in elsewhere if STIMULUS_NAME.search(at.rpartition("/")[2])]
+    named = [at for at in elsewhere if STIMULUS_NAME.search(at.rpartition("/")[2])]
+    candidates = first or named or [at for at in elsewhere if _onset_column(file, at) is not None]
     # Regular samples and epochs are hardly ever stimuli.
     perhaps = [at for at in elsewhere if not (file.has(f"{at}/starting_time") or at.endswith("/epochs"))]
     if not candidates and perhaps:
@@ -75,10 +84,25 @@ def _can_be_stimuli(file: Hdf5File, at: str) -> bool:
     return any(file.has(f"{at}/{name}") for name in ("start_time", "timestamps", "starting_time"))
 
 
-def _of_intervals(file: Hdf5File, at: str, findings: list[Finding]) -> dict[str, Any]:
-    time_s = file.read(f"{at}/start_time").reshape(-1)
+def _onset_column(file: Hdf5File, at: str) -> str | None:
+    """The name of the column with the times of the stimuli, if there is one, with times within their intervals."""
+    named = [name for name in file.names(at) if ONSET_NAME.fullmatch(name)]
+    if len(named) != 1 or not isinstance(node := file.node(f"{at}/{named[0]}"), h5py.Dataset) or node.dtype.kind != "f":
+        return None
+    onset_s, start_s, stop_s = (file.read(f"{at}/{name}").reshape(-1) for name in (*named, "start_time", "stop_time"))
+    if not len(onset_s) == len(start_s) == len(stop_s):
+        return None
+    known = np.isfinite(onset_s)
+    # Times since the beginning of the trial, or in ms, lie elsewhere.
+    lies_within = (start_s <= onset_s) & (onset_s <= stop_s)
+    return named[0] if np.any(known) and np.all(lies_within[known]) else None
+
+
+def _of_intervals(file: Hdf5File, at: str, onset: str | None, findings: list[Finding]) -> dict[str, Any]:
+    """The columns of a table of intervals, at whose start, or in whose column `onset`, the stimuli begin."""
+    time_s = file.read(f"{at}/{onset or 'start_time'}").reshape(-1)
     columns: dict[str, Any] = {"stimulus_time_s": time_s}
-    used = set(NO_STIMULUS_COLUMNS)
+    used = {*NO_STIMULUS_COLUMNS, onset}
     for column, names in COLUMNS.items():
         for name in names:
             if (values := _values(file, f"{at}/{name}", column, time_s)) is not None:
