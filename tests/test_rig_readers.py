@@ -760,6 +760,32 @@ def test_times_of_stimuli_outside_their_trials_are_not_taken(onset_s: list[float
     assert "stim_onset_time" in found(recording)["columns-left-out"]
 
 
+@pytest.mark.parametrize("name", ["stimuli", "sweeps"])
+def test_stimuli_are_read_from_a_table_of_events(name: str, tmp_path: Path) -> None:
+    event = pytest.importorskip("pynwb.event", reason="this version of pynwb has no tables of events")
+    import pynwb
+
+    start = datetime.datetime(2024, 1, 1, tzinfo=datetime.UTC)
+    nwb = pynwb.NWBFile(session_description="x", identifier="x", session_start_time=start)
+    nwb.add_unit(spike_times=[0.1, 0.5, 0.9])
+    table = event.EventsTable(name=name, description="x")
+    table.add_column("frequency_hz", "of the pulses")
+    for time_s, frequency_hz in ((0.75, 20.0), (np.nan, 20.0), (0.25, 5.0)):
+        table.add_event(timestamp=time_s, duration=0.001, annotation="by hand", frequency_hz=frequency_hz)
+    nwb.add_events_table(table)
+    with pynwb.NWBHDF5IO(str(tmp_path / "a.nwb"), "w") as nwb_io:
+        nwb_io.write(nwb)
+    if name == "sweeps":
+        assert "events/sweeps" in found(read_recording(tmp_path / "a.nwb"))["stimuli-elsewhere"]
+    recording = read_recording(tmp_path / "a.nwb", stimuli=None if name == "stimuli" else name)
+    assert recording.stimuli.time_s.tolist() == [0.25, 0.75]
+    assert recording.stimuli.frequency_hz.tolist() == [5.0, 20.0]
+    assert found(recording)["stimuli-from"] == (
+        f"2 stimuli are taken from /events/{name}/timestamp; 1 of 3 rows have none"
+    )
+    assert "columns-left-out" not in found(recording)
+
+
 def test_nothing_is_known_after_a_cl1s_index_repeats_itself(tmp_path: Path) -> None:
     said = [packed_text(json.dumps({"frequency_hz": hz, "pattern": n})) for n, hz in enumerate((5.0, 10.0, 20.0, 40.0))]
     frames = (1000, 2000, 3000, 4000)

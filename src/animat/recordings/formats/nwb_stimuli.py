@@ -18,7 +18,7 @@ from animat.recordings.formats.text_table import whole_numbers
 from animat.tables import UNKNOWN, padded
 
 FIRST = "stimulus/presentation"
-ELSEWHERE = ("intervals", "acquisition")
+ELSEWHERE = ("events", "intervals", "acquisition")
 STIMULUS_NAME = re.compile(r"stim|pulse|trigger|ttl", re.IGNORECASE)
 COLUMNS = {
     "stimulus_frequency_hz": ("frequency_hz", "frequency", "stimulus_frequency", "stim_frequency"),
@@ -26,8 +26,8 @@ COLUMNS = {
     "stimulus_presentation": ("presentation",),
     "stimulus_electrodes": ("electrode_ids", "electrode_id", "electrodes", "electrode"),
 }
-NO_STIMULUS_COLUMNS = ("id", "start_time", "stop_time", "tags", "timeseries")
-"""Columns that any table of intervals may have."""
+NO_STIMULUS_COLUMNS = ("id", "start_time", "stop_time", "tags", "timeseries", "timestamp", "duration", "annotation")
+"""Columns that any table of intervals or events may have."""
 ONSET_NAME = re.compile(r"stim(ulus)?_?(on|onset|start)(_?times?)?", re.IGNORECASE)
 """A column of the times at which the stimuli of trials begin, which is later than the trials themselves."""
 APART_S = 0.001
@@ -42,13 +42,12 @@ def read_stimuli(file: Hdf5File, asked: str | None, findings: list[Finding]) -> 
     at = _place(file, asked, findings)
     if at is None:
         return {"stimulus_time_s": np.empty(0)}
-    is_table = file.has(f"{at}/start_time")
-    onset = _onset_column(file, at) if is_table else None
-    columns = _of_intervals(file, at, onset, findings) if is_table else {"stimulus_time_s": _of_series(file, at)}
+    times = _times_column(file, at)
+    columns = {"stimulus_time_s": _of_series(file, at)} if times is None else _of_table(file, at, times, findings)
     n_rows, source = len(columns["stimulus_time_s"]), at
-    if onset is not None:
+    if times not in (None, "start_time"):
         has_one = np.isfinite(columns["stimulus_time_s"])
-        columns, source = {name: values[has_one] for name, values in columns.items()}, f"{at}/{onset}"
+        columns, source = {name: values[has_one] for name, values in columns.items()}, f"{at}/{times}"
     n = len(columns["stimulus_time_s"])
     without = f"; {n_rows - n:,} of {n_rows:,} rows have none" if n < n_rows else ""
     findings.append(Finding("stimuli-from", "note", f"{n:,} stimuli are taken from /{source}{without}", float(n)))
@@ -81,15 +80,24 @@ def _place(file: Hdf5File, asked: str | None, findings: list[Finding]) -> str | 
 def _can_be_stimuli(file: Hdf5File, at: str) -> bool:
     if file.attribute(at, "neurodata_type") in ("ElectricalSeries", "LFP", "SpikeEventSeries"):
         return False
-    return any(file.has(f"{at}/{name}") for name in ("start_time", "timestamps", "starting_time"))
+    return any(file.has(f"{at}/{name}") for name in ("start_time", "timestamp", "timestamps", "starting_time"))
+
+
+def _times_column(file: Hdf5File, at: str) -> str | None:
+    """The column of a table with the times of the stimuli: of events or of intervals; None for a series."""
+    if file.has(f"{at}/timestamp"):
+        return "timestamp"
+    return (_onset_column(file, at) or "start_time") if file.has(f"{at}/start_time") else None
 
 
 def _onset_column(file: Hdf5File, at: str) -> str | None:
     """The name of the column with the times of the stimuli, if there is one, with times within their intervals."""
     named = [name for name in file.names(at) if ONSET_NAME.fullmatch(name)]
-    if len(named) != 1 or not isinstance(node := file.node(f"{at}/{named[0]}"), h5py.Dataset) or node.dtype.kind != "f":
+    columns = [f"{at}/{name}" for name in (*named, "start_time", "stop_time")]
+    nodes = [file.node(column) for column in columns]
+    if len(named) != 1 or not all(isinstance(node, h5py.Dataset) and node.dtype.kind == "f" for node in nodes):
         return None
-    onset_s, start_s, stop_s = (file.read(f"{at}/{name}").reshape(-1) for name in (*named, "start_time", "stop_time"))
+    onset_s, start_s, stop_s = (file.read(column).reshape(-1) for column in columns)
     if not len(onset_s) == len(start_s) == len(stop_s):
         return None
     known = np.isfinite(onset_s)
@@ -98,11 +106,11 @@ def _onset_column(file: Hdf5File, at: str) -> str | None:
     return named[0] if np.any(known) and np.all(lies_within[known]) else None
 
 
-def _of_intervals(file: Hdf5File, at: str, onset: str | None, findings: list[Finding]) -> dict[str, Any]:
-    """The columns of a table of intervals, at whose start, or in whose column `onset`, the stimuli begin."""
-    time_s = file.read(f"{at}/{onset or 'start_time'}").reshape(-1)
+def _of_table(file: Hdf5File, at: str, times: str, findings: list[Finding]) -> dict[str, Any]:
+    """The columns of a table of intervals or events, with the times of the stimuli in the column `times`."""
+    time_s = file.read(f"{at}/{times}").reshape(-1)
     columns: dict[str, Any] = {"stimulus_time_s": time_s}
-    used = {*NO_STIMULUS_COLUMNS, onset}
+    used = {*NO_STIMULUS_COLUMNS, times}
     for column, names in COLUMNS.items():
         for name in names:
             if (values := _values(file, f"{at}/{name}", column, time_s)) is not None:
