@@ -562,6 +562,14 @@ def test_a_truncated_gzip_is_refused_in_one_line(share: float, tmp_path: Path) -
         read_recording(tmp_path / "a_spikes.csv.gz")
 
 
+def test_a_gzip_that_unpacks_to_far_more_than_any_table_is_refused(tmp_path: Path) -> None:
+    content = gzip.compress(b"time,channel\n" + b"0.5,1\n" * 1_000_000)
+    assert len(content) < 20_000
+    (tmp_path / "a_spikes.csv.gz").write_bytes(content)
+    with pytest.raises(InvalidFile, match=r"a_spikes.csv.gz: unpacks to over 4,[\d,]+ bytes, too many for its size"):
+        read_recording(tmp_path / "a_spikes.csv.gz")
+
+
 # --- any file, folders -----------------------------------------------------------------------------------------------
 
 
