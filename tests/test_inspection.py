@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -449,6 +452,18 @@ def test_another_ending_is_refused(tmp_path: Path) -> None:
     figure = draw_response_histograms(extract_responses(answering({5: 10.0})))
     with pytest.raises(InvalidArgument, match="expected a figure's name to end in"):
         save_figure(figure, tmp_path / "figure.xyz")
+
+
+def test_the_users_settings_of_matplotlib_do_not_change_a_commands_figures(tmp_path: Path) -> None:
+    (tmp_path / "matplotlib").mkdir()
+    (tmp_path / "matplotlib/matplotlibrc").write_text("text.usetex: True\nlines.linewidth: 9\nfont.size: 30\n")
+    np.savez(tmp_path / "a.npz", spike_time_s=[0.5, 2.5], spike_channel=[0, 1], stimulus_time_s=[])
+    command = [sys.executable, "-m", "animat", "inspect", "a.npz", "--format", "svg", "--out"]
+    for out, settings in (("with", {"XDG_CONFIG_HOME": str(tmp_path)}), ("without", {})):
+        done = subprocess.run([*command, out], cwd=tmp_path, env=os.environ | settings, capture_output=True, text=True)
+        assert done.returncode == 1 and "no-stimuli" in done.stdout, done.stderr
+    figures = [(tmp_path / out / "a-raster.svg").read_bytes() for out in ("with", "without")]
+    assert figures[0] == figures[1]
 
 
 def test_a_recording_without_stimuli_can_be_drawn(tmp_path: Path) -> None:

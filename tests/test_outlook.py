@@ -30,6 +30,11 @@ def responses(start_min: float, rate_hz: np.ndarray) -> Responses:
     )
 
 
+def test_files_fill_five_megabytes_a_minute_until_the_plan_or_the_budget_ends() -> None:
+    assert Outlook(60.0, None, math.inf).room_bytes == 300e6
+    assert Outlook(60.0, None, 12.0).room_bytes == 60e6
+
+
 def test_a_steady_fall_is_estimated_exactly() -> None:
     """P50 = 10 exp(-0.01 t), with recordings whose responses are all the same: no error."""
     series = [responses(t, np.full(40, 10.0 * math.exp(-0.01 * t))) for t in (0.0, 10.0, 25.0)]

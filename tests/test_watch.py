@@ -59,7 +59,24 @@ def test_the_numbers_of_the_page_are_those_of_the_table(folder: Path) -> None:
         assert ticks["reward"][i] == (float(row["reward"]) if row["reward"] else None)
         observed = [row[name] for name in about["observed"]]
         assert ticks["observation"][i] == ([float(each) for each in observed] if observed[0] else [])
-    assert found["state"] == "ended"
+    assert (found["state"], found["damage"]) == ("ended", "")
+
+
+def test_thresholds_from_before_the_span_are_shown(folder: Path, tmp_path: Path) -> None:
+    log = read_log(folder / LOG_FILE)
+    writer, end_s, adapted = LogWriter(tmp_path / LOG_FILE, log.header), 0.0, []
+    for record in log:
+        fields = record.fields
+        if fields["kind"] == "seen":
+            end_s = fields["start_s"] + fields["duration_s"]
+        if fields.get("tick"):
+            adapted.append((end_s, [float(len(adapted))] * 11))
+            fields = {**fields, "percentiles_hz": adapted[-1][1]}
+        writer.append(record._replace(fields=fields))
+    writer.close()
+    found = whole(SessionView(tmp_path), span_s=0.1)
+    assert found["percentiles"] == adapted
+    assert adapted[0][0] < found["from_s"]
 
 
 def test_episodes_that_are_all_alike_have_no_interval(folder: Path) -> None:

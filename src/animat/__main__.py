@@ -8,6 +8,8 @@ from animat.ctrl_c import interruptible
 
 def main() -> int:
     """Run one command (`animat.cli.main`); Ctrl-C or a kill ends it with one line, even while it is being loaded."""
+    # The user's own settings of matplotlib would change figures; if they want LaTeX, labels would have to be LaTeX.
+    os.environ["MATPLOTLIBRC"] = os.devnull
     try:
         with interruptible():
             from animat.cli import main as run
