@@ -34,7 +34,7 @@ from animat.errors import (
 from animat.live import shadowing
 from animat.live.plan import LOG_FILE, Timetable, check_plan
 from animat.live.shadowing import LiveRun, live
-from animat.live.trainers import Exchange
+from animat.live.trainers import Exchange, Trainers
 from animat.neurons.synthetic import synthetic_simulator
 from animat.neurons.timeline import fit_timeline
 from animat.reality_gap import Calibration
@@ -341,7 +341,11 @@ class Pressing:
 
 
 @pytest.mark.oracle
-def test_ctrl_c_keeps_recordings_and_policies_and_stops_the_culture(tmp_path: Path) -> None:
+def test_ctrl_c_keeps_recordings_and_policies_and_stops_the_culture(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    finish, was_stopped = Trainers.finish, []
+    monkeypatch.setattr(Trainers, "finish", lambda self: was_stopped.append(culture.is_stopped) or finish(self))
     with FakeCulture() as culture:
         with pytest.raises(KeyboardInterrupt):
             live(
@@ -352,7 +356,8 @@ def test_ctrl_c_keeps_recordings_and_policies_and_stops_the_culture(tmp_path: Pa
                 timetable=Timetable(interval_min=10, duration_min=1000, speed=1e4),
                 progress=Pressing(),
             )
-        assert culture.is_stopped
+        # Before the policies were waited for.
+        assert was_stopped == [True]
         assert culture.after_halt == 0
     assert list(load_policies(tmp_path / "live" / "policies")) == ["p0"]
     assert not (tmp_path / "live" / ".exchange").exists()

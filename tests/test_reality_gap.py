@@ -41,7 +41,7 @@ from animat.neurons.simulator import NeuronSimulator, fit_empirical, pooled_perc
 from animat.neurons.synthetic import LABELS, MEANS_HZ
 from animat.neurons.timeline import Kind, fit_timeline
 from animat.reality_gap import Calibration, RealityGap, Row, check_policies, run_policies
-from animat.reality_gap.predicting import EPISODES, ROLL_OUTS, roll_out_seed
+from animat.reality_gap.predicting import EPISODES, ROLL_OUTS, predict, roll_out_seed
 from animat.reality_gap.row import resampled_means
 from animat.reality_gap.running import planned_episodes
 from animat.reality_gap.session_responses import read_responses
@@ -118,6 +118,29 @@ def without_controls(tmp_path_factory: pytest.TempPathFactory, series: list[Resp
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("animat.reality_gap.calibration.BOOTSTRAPS", 4)
         return *run(tmp_path_factory.mktemp("run"), series, with_controls=False, report=lines.append), lines
+
+
+@pytest.mark.parametrize("greedy", [True, False])
+def test_policies_are_greedy_or_draw_in_prediction_and_loop_alike(
+    greedy: bool, tmp_path: Path, series: list[Responses], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("animat.reality_gap.calibration.BOOTSTRAPS", 2)
+    policy = policy_of(0, series)
+    # One condition is slightly more probable than the others, whatever is observed.
+    even = [np.zeros_like(weights) for weights in policy.weights], [np.zeros_like(biases) for biases in policy.biases]
+    even[1][-1][3] = 0.1
+    policy = replace(policy, weights=tuple(even[0]), biases=tuple(even[1]))
+    predicted: list[Any] = []
+    monkeypatch.setattr(
+        "animat.reality_gap.running.predict",
+        lambda *given, **named: predicted.append(predict(*given, **named)) or predicted[0],
+    )
+    with FakeCulture() as culture:
+        calibration = Calibration.of_series(series)
+        run_policies({"p0": policy}, culture, calibration, tmp_path, episodes=4, with_controls=False, greedy=greedy)
+    acted = [tick for tick in read_session(tmp_path).ticks if tick.agent == "p0" and tick.handled != "warm-up"]
+    for chosen in ({tick.chosen for tick in acted}, set(np.flatnonzero(predicted[0]["p0"].presented).tolist())):
+        assert chosen == {3} if greedy else len(chosen) > 3
 
 
 @pytest.mark.oracle
