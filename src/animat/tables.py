@@ -72,7 +72,7 @@ def evenly(n: int, most: int) -> Int64[np.ndarray, " some"]:
 def expect_times(name: str, times_s: Float64[np.ndarray, " times"]) -> None:
     """Raise UnusableData, naming the column, for times that are not finite or not within a century."""
     if bad := np.count_nonzero(~np.isfinite(times_s)):
-        raise UnusableData(f"{name}: expected finite times in seconds, got {bad} of {len(times_s)} NaN or infinite")
+        raise UnusableData(f"{name}: expected finite times in seconds, got {bad:,} of {len(times_s):,} NaN or infinite")
     far = np.abs(times_s) > CENTURY_S
     if np.any(far):
         got = times_s[far][0]

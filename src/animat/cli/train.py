@@ -291,6 +291,6 @@ def _memories(timeline: SimulatorTimeline) -> Iterator[str]:
             text = (
                 f"a response depends on earlier trials, where each trial counts {decay:.2g} times as much as the one "
                 f"after it, and a stimulus {weight:.2g} times as much as its response{load}. The simulator draws from "
-                f"the {near} responses with the most similar history, out of {total} per condition"
+                f"the {near} responses with the most similar history, out of {total:,} per condition"
             )
             yield f"memory at {in_min(start_min)}: {'none was found' if memory == NO_MEMORY else text}"

@@ -93,8 +93,8 @@ def bursts(evidence: Evidence) -> Finding | None:
     if count < max(_FEWEST_BURSTS, LEAST_BURSTS * n):
         return None
     message = (
-        f"{100 * count / n:.0f} % of {n} responses were bursts ({100 * evidence.calibration.burst_share:.0f} % in the "
-        "recording), which the prediction leaves out"
+        f"{100 * count / n:.0f} % of {n:,} responses were bursts ({100 * evidence.calibration.burst_share:.0f} % in "
+        "the recording), which the prediction leaves out"
     )
     return Finding("bursts", "note", message, count / n)
 

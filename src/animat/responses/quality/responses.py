@@ -98,14 +98,14 @@ def _left_out(
         known = f"; the recording has {some_of([each.label for each in occurring])}" if occurring else ""
         others = " or ".join(each for each in ("frequency", "interval", "electrode", "pattern") if each != by)
         message = (
-            f"none of {n_read} stimuli belongs to the conditions {by}{known}: choose others (--conditions {others})"
+            f"none of {n_read:,} stimuli belongs to the conditions {by}{known}: choose others (--conditions {others})"
         )
         yield Finding("no-condition", "refuse", message, float(without))
     elif without:
-        message = f"left out, as they belong to no condition: {without} of {n_read} stimuli"
+        message = f"left out, as they belong to no condition: {without:,} of {n_read:,} stimuli"
         yield Finding("no-condition", "note", message, float(without))
     if inside is not None and (late := int(np.count_nonzero(read & has_condition & ~inside))):
-        message = f"left out, as their window runs past the end of the recording: {late} of {n_read} stimuli"
+        message = f"left out, as their window runs past the end of the recording: {late:,} of {n_read:,} stimuli"
         yield Finding("window-past-end", "note" if late < 0.05 * n_read else "warning", message, float(late))
 
 
@@ -254,7 +254,7 @@ def _bursts(responses: Responses, bursts: BurstSeparation) -> Iterator[Finding]:
     if not n_bursts:
         return
     share = n_bursts / n
-    dropped = f"{n_bursts} of {n} responses ({100 * share:.1f} %) are set apart as bursts"
+    dropped = f"{n_bursts:,} of {n:,} responses ({100 * share:.1f} %) are set apart as bursts"
     if share > MANY_BURSTS:
         message = (
             f"{dropped}; bursts should be rare, so these may be the responses themselves, and the rest failed stimuli: "
