@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import csv
+import io
 import itertools
 import json
 import math
@@ -16,11 +17,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from animat.closed_loop.log import LogWriter, Record, read_log
 from animat.closed_loop.session import LOG_FILE, read_session
 from animat.closed_loop.tick import STOP_FILE
 from animat.errors import InvalidArgument, InvalidFile
+from animat.robots import Navigation
+from animat.robots.drawing import draw_robot
 from animat.watch.session import SessionView, _in_force, stop_session
 from animat.watch.tail import Tail, by_agent
 from watching import session_in
@@ -77,6 +81,20 @@ def test_thresholds_from_before_the_span_are_shown(folder: Path, tmp_path: Path)
     found = whole(SessionView(tmp_path), span_s=0.1)
     assert found["percentiles"] == adapted
     assert adapted[0][0] < found["from_s"]
+
+
+def test_the_picture_shows_the_robot_with_the_path_of_its_episode(folder: Path) -> None:
+    view = SessionView(folder)
+    ticks = whole(view)["ticks"]
+    rows = [i for i, observation in enumerate(ticks["observation"]) if observation]
+    # The second episode, up to its fourth iteration.
+    own = [i for i in rows if ticks["episode"][i] == ticks["episode"][rows[0]] + 1][:4]
+    *earlier, now = (np.array(ticks["observation"][i]) for i in own)
+    command = float(np.ravel(ticks["command"][own[-1]] or 0.0)[0])
+    expected = draw_robot(Navigation(episode_limit=6), now, command=command, earlier=earlier)
+    picture = view.picture(view.view(ticks["time_s"][own[-1]], 1.0)["picture"])
+    assert picture is not None and len(own) == 4
+    np.testing.assert_array_equal(np.asarray(Image.open(io.BytesIO(picture)).convert("RGB")), expected)
 
 
 def test_episodes_that_are_all_alike_have_no_interval(folder: Path) -> None:
