@@ -99,6 +99,9 @@ def mann_whitney(first: Float64[np.ndarray, " n"], second: Float64[np.ndarray, "
     """The U of the first group, and the two-sided p by the normal approximation as in `compare`; it is never 0."""
     from scipy.stats import mannwhitneyu
 
+    if np.ptp(np.concatenate([first, second])) == 0:
+        # From 1.18 on SciPy returns NaN.
+        return len(first) * len(second) / 2, 1.0
     test = mannwhitneyu(first, second, alternative="two-sided", method="asymptotic")
     # Of groups of hundreds p can underflow to 0.
     return float(test.statistic), max(float(test.pvalue), sys.float_info.min)
