@@ -144,6 +144,13 @@ def clear_away(leftover: Path) -> None:
         leftover.unlink()
 
 
+def clear_leftovers(folder: Path, *names: str) -> None:
+    """Remove what killed runs left in a folder of files with these names, which may be patterns."""
+    for name in names:
+        for leftover in folder.glob(f".{name}.*.partial*"):
+            clear_away(leftover)
+
+
 def is_unfinished(path: Path) -> bool:
     """Whether a file's name is one that `atomic_write` uses while writing; a killed process may leave such a file."""
     return _UNFINISHED.fullmatch(path.name) is not None

@@ -27,7 +27,7 @@ from animat.recordings.metadata import from_metadata
 from animat.recordings.recording import Recording
 from animat.stimulation.stimulus import Stimuli
 from animat.tables import UNKNOWN
-from animat.writing import atomic_write, clear_away, exclusive_lock, expect_writable, is_unfinished
+from animat.writing import atomic_write, clear_leftovers, exclusive_lock, expect_writable
 
 LOG_FILE = "session.log"
 RECORDING_FILE = "session.nwb"
@@ -271,10 +271,7 @@ def recover_session(path: str | os.PathLike[str], progress: Progress | None = No
     with exclusive_lock(read_session(path).folder):
         session = read_session(path)
         _expect_no_loss(session)
-        for leftover in session.folder.glob(".*"):
-            # Files that the killed program was writing.
-            if is_unfinished(leftover) and leftover.name.startswith((f".{RECORDING_FILE}.", f".{TICKS_FILE}.")):
-                clear_away(leftover)
+        clear_leftovers(session.folder, RECORDING_FILE, TICKS_FILE)
         session.write(progress)
     return session
 

@@ -24,7 +24,7 @@ from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
 from animat.stimulation.protocol import Protocol
 from animat.stimulation.schedule import make_schedule
-from animat.writing import clear_away, exclusive_lock, expect_writable
+from animat.writing import clear_leftovers, exclusive_lock, expect_writable
 
 STATE_FILE = "culture.state"
 SELECTION_FILE = "selection.json"
@@ -117,10 +117,7 @@ def record_series(
             culture.schedule(protocol, seed)
         if virtual is None:
             zero_s = _start_s(made, culture, protocol, interval_s)
-        # Partial files of a killed run; no reader takes them for complete ones.
-        for name in (".recording_*_min.nwb", f".{STATE_FILE}", f".{SELECTION_FILE}"):
-            for leftover in folder.glob(f"{name}.*.partial*"):
-                clear_away(leftover)
+        clear_leftovers(folder, "recording_*_min.nwb", STATE_FILE, SELECTION_FILE)
         follow = opened.enter_context(PartialRecording(folder))
         if virtual is not None and not (recorded and (folder / SELECTION_FILE).exists()):
             virtual.selection.save(folder / SELECTION_FILE)

@@ -12,7 +12,7 @@ import numpy as np
 
 from animat.recordings.columns import columns_of
 from animat.recordings.recording import Recording
-from animat.writing import atomic_write, clear_away
+from animat.writing import atomic_write, clear_away, clear_leftovers
 
 UNDER_WAY = ".under-way.npz"
 """Its name in the folder of the recordings; hidden, so that no reader takes it for one of them."""
@@ -45,5 +45,5 @@ class PartialRecording:
 
     def remove(self) -> None:
         """Remove the file, and the remains of killed runs."""
-        for file in (self._path, *self._path.parent.glob(f".{UNDER_WAY}.*.partial*")):
-            clear_away(file)
+        clear_away(self._path)
+        clear_leftovers(self._path.parent, UNDER_WAY)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
@@ -86,10 +86,6 @@ class Origin:
         if self.age is not None and (lengths_s := _lengths_s(self.age)) != sorted(lengths_s):
             raise InvalidArgument(f"age: expected a range with the younger age first, got {self.age!r}")
 
-    def to_provenance(self) -> Mapping[str, str]:
-        """The values given, as entries of `Recording.provenance`."""
-        return {name: value for name, value in vars(self).items() if value is not None}
-
 
 def convert_recording(
     path: str | os.PathLike[str],
@@ -137,14 +133,18 @@ def convert_recording(
         recording = read_traces(path, detection, part=part, stimuli=stimuli, progress=progress)
     else:
         recording = read_recording(path, stimuli_path=stimuli_path, stimuli=stimuli, part=part, start_s=start_s)
-    given = {} if origin is None else origin.to_provenance()
+    given = {name: text for name, text in vars(origin or Origin()).items() if text is not None}
     # The sex of a subject is unknown unless stated.
     default = {"sex": "U"} if "subject_id" in given else {}
     start_min = recording.start_min if start_min is None else start_min
     provenance = {**default, **recording.provenance, **given}
     read: dict[str, Any] = {"culture": culture_of(provenance), "recorded_at": date_of(provenance)}
-    recording = replace(recording, provenance=provenance, start_min=float(start_min), **read)
-    recording = replace(recording, findings=(*recording.findings, *_without_zone(recording)))
+    findings = recording.findings
+    date, is_noted = provenance.get("recorded_at"), any(finding.name == "zone-unknown" for finding in findings)
+    if date and read["recorded_at"] and datetime.fromisoformat(date).tzinfo is None and not is_noted:
+        message = f"recorded_at {date} has no time zone and is taken as UTC; add one, such as +09:00"
+        findings += (Finding("zone-unknown", "note", message),)
+    recording = replace(recording, provenance=provenance, start_min=float(start_min), findings=findings, **read)
     write_nwb(recording, out)
     return recording
 
@@ -157,15 +157,6 @@ def _lengths_s(age: str) -> list[float]:
             return []
         lengths_s.append(sum(float(n or 0) * unit_s for n, unit_s in zip(match.groups(), UNITS_S, strict=True)))
     return lengths_s
-
-
-def _without_zone(recording: Recording) -> Iterator[Finding]:
-    """A note on a date without a time zone."""
-    recorded_at = recording.provenance.get("recorded_at", "")
-    is_noted = any(finding.name == "zone-unknown" for finding in recording.findings)
-    if recording.recorded_at and datetime.fromisoformat(recorded_at).tzinfo is None and not is_noted:
-        message = f"recorded_at {recorded_at} has no time zone and is taken as UTC; add one, such as +09:00"
-        yield Finding("zone-unknown", "note", message)
 
 
 def read_traces(

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import importlib.metadata
 import json
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +29,7 @@ from animat.training.policy import Policy
 from animat.training.settings import LEARNER
 from animat.training.specification import CHUNKS, Training
 from animat.training.varied import expect_varied, varying_in
-from animat.writing import clear_away, write_whole
+from animat.writing import clear_leftovers, write_whole
 
 MANIFEST = "training.json"
 TABLE = "assessments.csv"
@@ -137,9 +135,8 @@ def write_description(folder: Path, manifest: dict[str, Any]) -> Path:
 def finish(training: Training, folder: Path) -> dict[str, Policy]:
     """Clear away what a kill left, and write what is missing once all policies are written; returns them by name."""
     # In other subfolders another training may be writing.
-    for place, name in product((folder, folder / BEST), ("p*.safetensors", MANIFEST, TABLE)):
-        for leftover in place.glob(f".{name}.*.partial*"):
-            clear_away(leftover)
+    for place in (folder, folder / BEST):
+        clear_leftovers(place, "p*.safetensors", MANIFEST, TABLE)
     policies = {f"p{i}": Policy.load(folder / f"p{i}.safetensors") for i in range(training.policies)}
     for name, policy in policies.items():
         if len(policy.assessments):
@@ -151,14 +148,15 @@ def finish(training: Training, folder: Path) -> dict[str, Policy]:
 
 def _write_assessments(folder: Path, policies: Mapping[str, Policy]) -> None:
     """Write the table of all assessments, with each policy's best one marked."""
-    rows = ["policy," + ",".join(ASSESSED) + ",best"]
+    from pandas import DataFrame, concat
+
+    tables = []
     for name, policy in policies.items():
-        best = -1 if policy.best is None else len(policy.best.assessments) - 1
-        for row, (iterations, minute, lesson, success, mean_return) in enumerate(policy.assessments.tolist()):
-            numbers = (minute, lesson, success, mean_return)
-            cells = ("" if math.isnan(number) else f"{number:.6g}" for number in numbers)
-            rows.append(",".join([name, f"{iterations:.0f}", *cells, str(int(row == best))]))
-    write_whole(folder / TABLE, "\n".join(rows) + "\n")
+        table = DataFrame(policy.assessments, columns=ASSESSED).astype({"iterations": int})
+        best = 0 if policy.best is None else len(policy.best.assessments)
+        tables.append(table.assign(policy=name, best=(table.index + 1 == best).astype(int)))
+    columns = ["policy", *ASSESSED, "best"]
+    write_whole(folder / TABLE, concat(tables).to_csv(columns=columns, index=False, float_format="%.6g"))
 
 
 def is_ours(folder: Path, manifest: dict[str, Any]) -> bool:
