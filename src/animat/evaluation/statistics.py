@@ -136,7 +136,7 @@ def interquartile_mean(samples: ArrayLike, *, within: tuple[float, float] = (-ma
 
     Source: Agarwal et al. 2021, arXiv:2108.13264 (rliable); the interval: Tukey and McLaughlin 1963, Sankhya A 25, 331.
     """
-    from scipy.stats import t
+    from scipy.special import stdtrit
 
     x = np.sort(_samples("samples", samples))
     n, cut = len(x), len(x) // 4
@@ -145,7 +145,7 @@ def interquartile_mean(samples: ArrayLike, *, within: tuple[float, float] = (-ma
     if kept < 2:
         return Interval(mean, *within, CONFIDENCE)
     spread = float(np.clip(x, x[cut], x[n - cut - 1]).std(ddof=1))
-    half = float(t.ppf((1 + CONFIDENCE) / 2, kept - 1)) * spread * math.sqrt((n - 1) / (kept * (kept - 1)))
+    half = float(stdtrit(kept - 1, (1 + CONFIDENCE) / 2)) * spread * math.sqrt((n - 1) / (kept * (kept - 1)))
     return Interval(mean, max(mean - half, within[0]), min(mean + half, within[1]), CONFIDENCE)
 
 
@@ -185,10 +185,10 @@ def standard_error(samples: Float64[np.ndarray, " samples"]) -> float:
 
 def interval_of_mean(samples: Float64[np.ndarray, " samples"]) -> Interval:
     """The mean with its 95 % interval by Student's t; infinite for one sample."""
-    from scipy.stats import t
+    from scipy.special import stdtrit
 
     mean, n = float(samples.mean()), len(samples)
-    half = float(t.ppf((1 + CONFIDENCE) / 2, n - 1) * samples.std(ddof=1) / math.sqrt(n)) if n > 1 else math.inf
+    half = float(stdtrit(n - 1, (1 + CONFIDENCE) / 2) * samples.std(ddof=1) / math.sqrt(n)) if n > 1 else math.inf
     return Interval(mean, mean - half, mean + half, CONFIDENCE)
 
 
