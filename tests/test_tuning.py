@@ -36,9 +36,9 @@ from animat.training.specification import CHUNKS, Training
 from animat.tuning import tasks
 from animat.tuning.results import BEST, HISTORY, RESULTS, Final, TuningResult, write_results
 from animat.tuning.run import tune
-from animat.tuning.search import JOURNAL, TrialResult, read_journal
+from animat.tuning.search import JOURNAL, Trial, read_journal
 from animat.tuning.specification import Range, Tuning, first_settings, read_tuning, tuning_of, with_settings
-from animat.tuning.tasks import Trial, Trials, group_by_shape
+from animat.tuning.tasks import Trials, group_by_shape
 from synthetic_recordings import synthetic_recording
 
 pytest.importorskip("optuna", reason="animat tune needs the extra [tune]")
@@ -152,7 +152,8 @@ def test_no_two_policies_of_a_final_meet_the_same_episodes(finished: Path, monke
     monkeypatch.setattr(tasks, "roll_out", roll_out)
     monkeypatch.setattr(Trials, "train", lambda *_: None)
     study = read_tuning(TINY).study
-    trial, place = Trial(0, first_settings(study, read_tuning(TINY).space)[0]), "finals-of-six"
+    settings, place = first_settings(study, read_tuning(TINY).space)[0], "finals-of-six"
+    trial = Trial(0, settings, "complete", (), ())
     for group in split_groups(6):
         tasks.TrainTrials(study, (trial,), group[:1], (1, 2), 5, (0, CHUNKS), place).run(finished, Silent())
     shutil.rmtree(finished / place)
@@ -244,13 +245,12 @@ def test_trials_of_one_program_are_together_five_policies_at_most(policies: int)
     rng = random.Random(policies)
     for n in range(1, 12):
         among = [
-            Trial(
-                i, {"tau": rng.random(), "mapping": rng.choice(["linear", "1-threshold"]), "batch": rng.choice([8, 9])}
-            )
-            for i in range(n)
+            {"tau": rng.random(), "mapping": rng.choice(["linear", "1-threshold"]), "batch": rng.choice([8, 9])}
+            for _ in range(n)
         ]
-        groups = group_by_shape(among, policies)
-        assert sorted(trial.number for group in groups for trial in group) == list(range(n))
+        trials = [Trial(i, settings, "complete", (), ()) for i, settings in enumerate(among)]
+        groups = group_by_shape(trials, policies)
+        assert sorted(trial.trial for group in groups for trial in group) == list(range(n))
         for group in groups:
             assert len(group) * policies <= max(5, policies)
             assert len({(t.settings["mapping"], t.settings["batch"]) for t in group}) == 1
@@ -307,7 +307,7 @@ def test_importance_finds_the_setting_that_decides() -> None:
     space = {"tau": Range(0.0, 1.0), "discount": Range(0.01, 0.99, True), "mapping": ("linear", "1-threshold")}
     results = []
     # However well it began.
-    results.append(TrialResult(60, {"tau": 0.9, "discount": 0.5, "mapping": "linear"}, "diverged", (7,), ((1e6,),)))
+    results.append(Trial(60, {"tau": 0.9, "discount": 0.5, "mapping": "linear"}, "diverged", (7,), ((1e6,),)))
     for i in range(60):
         settings: Any = {
             "tau": rng.random(),
@@ -315,7 +315,7 @@ def test_importance_finds_the_setting_that_decides() -> None:
             "mapping": ("linear", "1-threshold")[i % 2],
         }
         returns = -((settings["tau"] - 0.3) ** 2) + 1e-3 * rng.random()
-        results.append(TrialResult(i, settings, "complete", (60,), ((float(returns),),)))
+        results.append(Trial(i, settings, "complete", (60,), ((float(returns),),)))
     shares = importance_of(space, results)
     assert next(iter(shares)) == "tau" and shares["tau"] > 0.8
     assert sum(shares.values()) == pytest.approx(1)
@@ -326,9 +326,9 @@ def test_what_diverged_after_a_rung_is_not_drawn_as_stopped(tmp_path: Path, monk
     figures: list[Any] = []
     monkeypatch.setattr("animat.tuning.results.save_figure", lambda figure, _: figures.append(figure))
     settings = {"learning_rate": 1e-3, "discount": 0.99, "simulator": "histogram"}
-    own = TrialResult(0, settings, "complete", (20, 60), ((1.0,), (2.0,)))
-    stopped = TrialResult(1, settings, "stopped", (20,), ((0.0,),))
-    diverged = TrialResult(2, settings, "diverged", (20,), ((9.0,),))
+    own = Trial(0, settings, "complete", (20, 60), ((1.0,), (2.0,)))
+    stopped = Trial(1, settings, "stopped", (20,), ((0.0,),))
+    diverged = Trial(2, settings, "diverged", (20,), ((9.0,),))
     finals = [Final(3, settings, (3.0,)), Final(0, settings, (1.0, 3.0, 5.0)), Final(2, settings, None)]
     tuned = write_results(tmp_path, read_tuning(TINY), [own, stopped, diverged], finals)
     assert tuned.best.trial == 0, "of two with the same mean, the one that was found first"
@@ -378,7 +378,7 @@ def test_the_command_counts_a_single_trial_as_one(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     settings = {"learning_rate": 1e-3, "discount": 0.99, "simulator": "histogram"}
-    trial = TrialResult(0, settings, "complete", (20, 60), ((1.0,), (2.0,)))
+    trial = Trial(0, settings, "complete", (20, 60), ((1.0,), (2.0,)))
     final = Final(0, settings, (2.0, 2.1))
     tuned = TuningResult(tmp_path, final, (final,), (trial,), {})
     monkeypatch.setattr("animat.tuning.run.tune", lambda *_, **__: tuned)

@@ -202,7 +202,7 @@ class ContextGap:
         spread = float(np.linalg.norm([of_policies, _Z * (1 - value) * self.standard_error, value * grid_error]))
         below = span if self.best_known is None else self.best_known - self.coupling
         value, low, high = (each / (span if each >= 0 else below) for each in (over, over - spread, over + spread))
-        return Interval(value, low, high, CONFIDENCE)
+        return Interval(value, low, high)
 
     def to_dict(self) -> dict[str, Any]:
         """Everything as plain data."""
@@ -248,7 +248,7 @@ def context_gap(
         # Derivatives of the gap: by coupling -1, by random stimuli gap, by optimum 1 - gap, each divided by the span.
         parts = np.array([errors[0], value * errors[1], (1 - value) * optimum.grid_error / _Z])
         spread = float(_Z * np.linalg.norm(parts) / span)
-        gap = Interval(value, value - spread, value + spread, CONFIDENCE)
+        gap = Interval(value, value - spread, value + spread)
     return ContextGap(means[0], errors[0], gap)
 
 
@@ -275,5 +275,5 @@ def least_context_gap(
         # As above; coupling and random stimuli have the same starts and are compared pair by pair.
         spread = _Z * float(np.hypot((1 - value) * error, standard_error(value * random - coupling)) / span)
         value, low, high = (float(np.clip(each, 0, 1)) for each in (value, value - spread, value + spread))
-        gap = Interval(value, low, high, CONFIDENCE)
+        gap = Interval(value, low, high)
     return ContextGap(means[1], standard_error(coupling), gap, means[0], highest)

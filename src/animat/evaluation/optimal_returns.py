@@ -105,7 +105,7 @@ class WellSampled:
             low = min(low, float(optimal_values([at_random], grid, seed)[0][0] - values[0]))
         error = optimum.grid_error
         ends = np.clip(optimum.value + np.array([low - error, high + error]), least, most)
-        return replace(optimum, interval=Interval(optimum.value, float(ends[0]), float(ends[1]), CONFIDENCE))
+        return replace(optimum, interval=Interval(optimum.value, float(ends[0]), float(ends[1])))
 
 
 def with_enough_samples(responses: Responses) -> tuple[Responses, tuple[str, ...]]:

@@ -33,7 +33,7 @@ class Interval:
     value: float
     low: float
     high: float
-    confidence: float
+    confidence: float = CONFIDENCE
 
     def to_dict(self) -> dict[str, float]:
         """Everything as plain data."""
@@ -91,7 +91,7 @@ def compare(first: ArrayLike, second: ArrayLike) -> Comparison:
     total = len(a) * len(b)
     p_exact = p_normal if total > MOST_PAIRS else _exact_p(a, b)
     high, low = (1 - 2 * share for share in _shares_within(u_first / total, len(a), len(b)))
-    effect = Interval(1 - 2 * u_first / total, low, high, CONFIDENCE)
+    effect = Interval(1 - 2 * u_first / total, low, high)
     return Comparison(min(u_first, total - u_first), u_first, len(a), len(b), p_normal, p_exact, effect, ties)
 
 
@@ -139,17 +139,17 @@ def interquartile_mean(samples: ArrayLike, *, within: tuple[float, float] = (-ma
 
     Source: Agarwal et al. 2021, arXiv:2108.13264 (rliable); the interval: Tukey and McLaughlin 1963, Sankhya A 25, 331.
     """
-    from scipy.stats import t
+    from scipy.special import stdtrit
 
     x = np.sort(_samples("samples", samples))
     n, cut = len(x), len(x) // 4
     kept = n - 2 * cut
     mean = float(x[cut : n - cut].mean())
     if kept < 2:
-        return Interval(mean, *within, CONFIDENCE)
+        return Interval(mean, *within)
     spread = float(np.clip(x, x[cut], x[n - cut - 1]).std(ddof=1))
-    half = float(t.ppf((1 + CONFIDENCE) / 2, kept - 1)) * spread * math.sqrt((n - 1) / (kept * (kept - 1)))
-    return Interval(mean, max(mean - half, within[0]), min(mean + half, within[1]), CONFIDENCE)
+    half = float(stdtrit(kept - 1, (1 + CONFIDENCE) / 2)) * spread * math.sqrt((n - 1) / (kept * (kept - 1)))
+    return Interval(mean, max(mean - half, within[0]), min(mean + half, within[1]))
 
 
 def holm(p: Mapping[str, float]) -> dict[str, float]:
@@ -188,11 +188,11 @@ def standard_error(samples: Float64[np.ndarray, " samples"]) -> float:
 
 def interval_of_mean(samples: Float64[np.ndarray, " samples"]) -> Interval:
     """The mean with its 95 % interval by Student's t; infinite for one sample."""
-    from scipy.stats import t
+    from scipy.special import stdtrit
 
     mean, n = float(samples.mean()), len(samples)
-    half = float(t.ppf((1 + CONFIDENCE) / 2, n - 1) * samples.std(ddof=1) / math.sqrt(n)) if n > 1 else math.inf
-    return Interval(mean, mean - half, mean + half, CONFIDENCE)
+    half = float(stdtrit(n - 1, (1 + CONFIDENCE) / 2) * samples.std(ddof=1) / math.sqrt(n)) if n > 1 else math.inf
+    return Interval(mean, mean - half, mean + half)
 
 
 def _samples(name: str, values: ArrayLike) -> Float64[np.ndarray, " samples"]:

@@ -10,7 +10,7 @@ import numpy as np
 from animat.errors import counted
 from animat.lazy import Figure
 from animat.report.colours import BLACK, BLUE, GREY, ORANGE
-from animat.report.html import Columns, Section, Table, cell, columns_of, picture_of, table_of, write_page
+from animat.report.html import Columns, Section, Table, cell, columns_of, picture_of, table_of, with_minus, write_page
 from animat.report.results import CONTEXT_GAP_LEVEL, ContextRow, LostRow
 from animat.report.style import add_common_legend, new_figure, save_formats, style_axes
 from animat.studies.context import TABLE, WHOSE_WORK, ContextRun, ContextStudy
@@ -148,12 +148,8 @@ def summarise_robot(rows: Sequence[ContextRow]) -> str:
 
 
 def _range(values: Sequence[float]) -> str:
-    low, high = (_hundredths(value) for value in (min(values), max(values)))
+    low, high = (with_minus(f"{value:z.2f}") for value in (min(values), max(values)))
     return low if low == high else f"{low} to {high}"
-
-
-def _hundredths(value: float) -> str:
-    return f"{value:z.2f}".replace("-", "−")
 
 
 def _shares_lost(rows: Sequence[ContextRow], lost: Sequence[LostRow]) -> dict[str, dict[str, list[float]]]:
@@ -173,7 +169,7 @@ def _on_the_simulator(rows: Sequence[ContextRow]) -> Table:
         ("best coupling", "coupling"),
         ("policies", "policies"),
         ("optimum", lambda row: row.optimum if row.best_known is None else f"≥ {cell(row.best_known)}"),
-        ("gap", lambda row: None if row.gap is None else _least(row) + _hundredths(row.gap)),
+        ("gap", lambda row: None if row.gap is None else _least(row) + with_minus(f"{row.gap:z.2f}")),
         ("score, 95 %", _score),
         ("bits", "bits"),
     ]

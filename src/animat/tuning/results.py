@@ -16,7 +16,7 @@ from animat.report.colours import BLACK, BLUE, GREY, ORANGE, PURPLE, RED, SKY
 from animat.report.style import add_common_legend, new_figure, save_figure, style_axes
 from animat.studies.folder import RECORDINGS
 from animat.studies.toml import study_to_toml
-from animat.tuning.search import TrialResult, importance_of
+from animat.tuning.search import Trial, importance_of
 from animat.tuning.specification import SEARCHABLE, THROUGH_NEURONS, Settings, Tuning, with_settings
 from animat.writing import write_whole
 
@@ -58,7 +58,7 @@ class TuningResult:
     folder: Path
     best: Final
     finals: tuple[Final, ...]
-    trials: tuple[TrialResult, ...]
+    trials: tuple[Trial, ...]
     importance: Mapping[str, float]
 
     def to_dict(self) -> dict[str, Any]:
@@ -73,7 +73,7 @@ class TuningResult:
         return {"best": best, "finals": rows, "trials": counts, "importance": dict(self.importance)}
 
 
-def write_results(folder: Path, tuning: Tuning, trials: Sequence[TrialResult], finals: Sequence[Final]) -> TuningResult:
+def write_results(folder: Path, tuning: Tuning, trials: Sequence[Trial], finals: Sequence[Final]) -> TuningResult:
     """Write the results of a tuning into its folder, reproducibly."""
     importance = importance_of(tuning.space, trials)
     # Among equals the study's own, or else the one that was found first.

@@ -27,9 +27,9 @@ from animat.studies.task import draw_seed
 from animat.training.group import split_groups
 from animat.training.specification import CHUNKS
 from animat.tuning.results import Final, TuningResult, write_results
-from animat.tuning.search import Search, TrialResult, expect_optuna, read_journal, write_journal
+from animat.tuning.search import Search, Trial, expect_optuna, read_journal, write_journal
 from animat.tuning.specification import Tuning, choices_of, first_settings, with_settings
-from animat.tuning.tasks import Fit, TrainTrials, Trial, group_by_shape, returns_file, timeline_file
+from animat.tuning.tasks import Fit, TrainTrials, group_by_shape, returns_file, timeline_file
 
 MANIFEST = "tune.json"
 FINALS = "finals"
@@ -95,16 +95,17 @@ class _Run:
         fits = [Job(f"fit/{timeline_file(each).stem}", Fit(each), (JOB,), 3) for each in variants]
         self._run_jobs([Job(JOB, Record(study, base), (), 5), *fits], RECEIPTS, 20, "recordings and simulators")
 
-    def search(self) -> list[TrialResult]:
+    def search(self) -> list[Trial]:
         """Run all trials, reusing those in the journal."""
         tune, search, known = self._tuning.tune, Search(self._tuning), read_journal(self._folder)
-        results: list[TrialResult] = []
+        results: list[Trial] = []
         for first in range(0, tune.trials, tune.together):
             proposed = search.ask(min(tune.together, tune.trials - first))
             batch = known[first : first + len(proposed)]
             place = f"{UNFINISHED}/from-{first}"
             if len(batch) < len(proposed):
-                batch = self._run_batch([Trial(first + i, settings) for i, settings in enumerate(proposed)], place)
+                new = [Trial(number, settings, "complete", (), ()) for number, settings in enumerate(proposed, first)]
+                batch = self._run_batch(new, place)
                 write_journal(self._folder, results + batch)
             elif [result.settings for result in batch] != proposed:
                 raise InvalidFile(
@@ -119,31 +120,30 @@ class _Run:
             search.report(batch)
         return results
 
-    def _run_batch(self, trials: Sequence[Trial], place: str) -> list[TrialResult]:
+    def _run_batch(self, trials: Sequence[Trial], place: str) -> list[Trial]:
         """Successive halving: all trials up to the first rung, the best of them up to the next, and so on."""
         tune = self._tuning.tune
         seeds = draw_seed("tuning", tune.seed, "training"), draw_seed("tuning", tune.seed, "episodes")
         members, rungs = tuple(range(tune.policies)), tune.chunks
-        results = {trial.number: TrialResult(trial.number, trial.settings, "complete", (), ()) for trial in trials}
+        results = {trial.trial: trial for trial in trials}
         for rung, (first, last) in enumerate(zip([0, *rungs], rungs, strict=False)):
-            racing = [trial for trial in trials if results[trial.number].state == "complete"]
+            racing = [trial for trial in results.values() if trial.state == "complete"]
             jobs = [
                 self._job(
-                    f"rung-{rung + 1}/trials-{','.join(str(trial.number) for trial in group)}",
+                    f"rung-{rung + 1}/trials-{','.join(str(trial.trial) for trial in group)}",
                     TrainTrials(self._tuning.study, group, members, seeds, tune.episodes, (first, last), place),
                 )
                 for group in group_by_shape(racing, tune.policies)
             ]
-            note = f"trials {trials[0].number} to {trials[-1].number} of {tune.trials}, rung {rung + 1} of {len(rungs)}"
+            note = f"trials {trials[0].trial} to {trials[-1].trial} of {tune.trials}, rung {rung + 1} of {len(rungs)}"
             self._run_jobs(jobs, f"{place}/jobs", sum(job.cost_s for job in jobs), note)
             for trial in racing:
                 returns = json.loads(returns_file(self._folder / place, trial, last, 0).read_text())
-                result = results[trial.number]
                 if returns is None:
-                    results[trial.number] = replace(result, state="diverged")
+                    results[trial.trial] = replace(trial, state="diverged")
                 else:
-                    chunks, every = (*result.chunks, last), (*result.returns, tuple(returns))
-                    results[trial.number] = replace(result, chunks=chunks, returns=every)
+                    chunks, every = (*trial.chunks, last), (*trial.returns, tuple(returns))
+                    results[trial.trial] = replace(trial, chunks=chunks, returns=every)
             if last < CHUNKS:
                 complete = [result for result in results.values() if result.state == "complete"]
                 complete.sort(key=lambda result: (-sum(result.returns[-1]), result.trial))
@@ -153,7 +153,7 @@ class _Run:
                         results[result.trial] = replace(result, state="stopped")
         return list(results.values())
 
-    def finals(self, results: Sequence[TrialResult]) -> list[Final]:
+    def finals(self, results: Sequence[Trial]) -> list[Final]:
         """Retrain the first settings and the best of the others with the study's policies, in fresh episodes."""
         tune, study = self._tuning.tune, self._tuning.study
         complete = [result for result in results if result.state == "complete"]
@@ -164,12 +164,12 @@ class _Run:
             )
         ranked = sorted(complete, key=lambda result: (-result.means[-1], result.trial))
         others = [result for result in ranked if result.trial >= self._first][: tune.finalists]
-        finalists = [Trial(result.trial, result.settings) for result in (*results[: self._first], *others)]
+        finalists = [*results[: self._first], *others]
         seeds = draw_seed("tuning", tune.seed, "final training"), draw_seed("tuning", tune.seed, "final episodes")
         split = split_groups(study.policies)
         jobs = [
             self._job(
-                f"final/trial-{trial.number}/p{members[0]}",
+                f"final/trial-{trial.trial}/p{members[0]}",
                 TrainTrials(study, (trial,), members, seeds, study.episodes, (0, CHUNKS), FINALS),
             )
             for trial in finalists
@@ -181,7 +181,7 @@ class _Run:
             files = (returns_file(self._folder / FINALS, trial, CHUNKS, members[0]) for members in split)
             groups = [json.loads(file.read_text()) for file in files]
             returns = None if None in groups else tuple(number for group in groups for number in group)
-            finals.append(Final(trial.number, trial.settings, returns))
+            finals.append(Final(trial.trial, trial.settings, returns))
         if all(final.returns is None for final in finals):
             raise UnusableData(f"{self._folder}: expected finite returns of the best trials, got none")
         return finals

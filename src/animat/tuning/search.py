@@ -19,7 +19,7 @@ from animat.writing import write_whole
 
 if TYPE_CHECKING:
     from optuna.distributions import BaseDistribution
-    from optuna.trial import Trial
+    from optuna.trial import Trial as Proposed
 
 JOURNAL = "journal.jsonl"
 """One line per trial, with its settings and returns, in the order of their numbers."""
@@ -28,10 +28,11 @@ FEWEST = 4
 
 
 @dataclass(frozen=True)
-class TrialResult:
-    """The result of a trial.
+class Trial:
+    """Settings to try, and how they did so far.
 
     Attributes:
+        trial: its number, from 0.
         state: `"complete"`, `"stopped"` early, as others did better, or `"diverged"`: its parameters were not finite.
         chunks: chunks of training done at the end of each rung that it reached with finite parameters.
         returns: the mean return of each policy at these ends.
@@ -49,18 +50,18 @@ class TrialResult:
         return [fmean(each) for each in self.returns]
 
 
-def write_journal(folder: Path, trials: Sequence[TrialResult]) -> None:
+def write_journal(folder: Path, trials: Sequence[Trial]) -> None:
     """Write the whole journal, without times of day, so that the same search writes the same bytes."""
     write_whole(folder / JOURNAL, "".join(json.dumps(asdict(trial)) + "\n" for trial in trials))
 
 
-def read_journal(folder: Path) -> list[TrialResult]:
+def read_journal(folder: Path) -> list[Trial]:
     """The trials in the folder's journal, none without a journal; raises InvalidFile if it cannot be read."""
     path = folder / JOURNAL
     if not path.exists():
         return []
     try:
-        trials = [read_record(TrialResult, json.loads(line)) for line in path.read_text().splitlines()]
+        trials = [read_record(Trial, json.loads(line)) for line in path.read_text().splitlines()]
         if [trial.trial for trial in trials] != list(range(len(trials))):
             raise ValueError("trials are missing")
     except (OSError, ValueError, RecursionError, TypeError) as error:
@@ -90,7 +91,7 @@ class Search:
         self._first = first_settings(tuning.study, tuning.space)
         for settings in self._first:
             self._study.enqueue_trial(_mirrored(tuning.space, settings))
-        self._running: list[Trial] = []
+        self._running: list[Proposed] = []
 
     def ask(self, n: int) -> list[Settings]:
         """Propose the settings of the next `n` trials, before the result of any of them is known."""
@@ -102,7 +103,7 @@ class Search:
                 settings.update(self._first[trial.number])
         return proposed
 
-    def report(self, results: Sequence[TrialResult]) -> None:
+    def report(self, results: Sequence[Trial]) -> None:
         """Report the results of the trials proposed last, in the same order."""
         for trial, result in zip(self._running, results, strict=True):
             if result.state != "diverged":
@@ -115,7 +116,7 @@ class Search:
                 self._study.tell(trial, state=self._optuna.trial.TrialState.PRUNED)
 
 
-def importance_of(space: Space, results: Sequence[TrialResult]) -> dict[str, float]:
+def importance_of(space: Space, results: Sequence[Trial]) -> dict[str, float]:
     """The share of each setting in the return after the first rung, the largest first; empty for too few trials.
 
     By PED-ANOVA (Watanabe et al. 2023, arXiv:2304.10255); every trial that did not diverge has the first rung's return.

@@ -30,7 +30,8 @@ from animat.training.group import CHECKPOINT_S, Group, SideBySide
 from animat.training.sac import Learner, begin, train_chunk
 from animat.training.settings import SAC
 from animat.training.specification import CHUNKS, Training
-from animat.tuning.specification import NUMBERS, Settings, with_settings
+from animat.tuning.search import Trial
+from animat.tuning.specification import NUMBERS, with_settings
 from animat.wrappers import EpisodeLimit
 from animat.writing import write_whole
 
@@ -53,14 +54,6 @@ class Fit(StudyTask):
     def make(self, folder: Path, progress: Progress) -> list[Path]:
         timeline = fit_simulators(self.study, read_series(self.study, folder))
         return [save_timeline(timeline, folder / timeline_file(self.study))]
-
-
-@dataclass(frozen=True)
-class Trial:
-    """Settings to try, with a number that counts from 0."""
-
-    number: int
-    settings: Settings
 
 
 @lru_cache(maxsize=8)
@@ -155,7 +148,7 @@ class TrainTrials(StudyTask):
         judging = _timeline(folder, _judge(self.study, studies[0]))
         together = Trials(training, timeline, algorithms, self.members)
 
-        numbers = ",".join(str(trial.number) for trial in self.trials)
+        numbers = ",".join(str(trial.trial) for trial in self.trials)
         checkpoint = place / f"t{numbers}-p{self.members[0]}-to-{last}-of-{CHUNKS}.npz"
         learners = [_learner_file(place, trial, first, self.members[0]) for trial in self.trials if first]
         files = [checkpoint] if checkpoint.exists() else learners
@@ -195,7 +188,7 @@ def returns_file(place: Path, trial: Trial, chunks: int, member: int) -> Path:
 
 
 def _learner_file(place: Path, trial: Trial, chunks: int, member: int) -> Path:
-    return place / f"t{trial.number}-p{member}-{chunks}.npz"
+    return place / f"t{trial.trial}-p{member}-{chunks}.npz"
 
 
 def _judge(own: Study, trial: Study) -> Study:

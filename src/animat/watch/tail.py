@@ -10,12 +10,14 @@ from array import array
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from statistics import fmean, stdev
 from typing import Any
+
+import numpy as np
 
 from animat.closed_loop.log import HEAD, MAGIC, RECORD, Record, parse_fields, parse_record
 from animat.closed_loop.outline import Episode, Outline
 from animat.errors import InvalidFile
+from animat.evaluation.statistics import interval_of_mean
 from animat.watch.files import mapped, number, numbers, text
 
 _KEPT = 4096
@@ -228,23 +230,11 @@ def by_agent(names: Sequence[str], episodes: Sequence[Episode], predictions: Any
         returns = returns_of.setdefault(text(episode.agent), [])
         if episode.is_whole and number(episode.total) is not None:
             returns.append(episode.total)
-    return [
-        {
-            "name": name,
-            "n": len(returns),
-            "returns": returns[-_MOST_RETURNS:],
-            "mean": number(fmean(returns)) if returns else None,
-            "half": number(_half_width(returns)),
-            "predicted": predicted.get(name),
-        }
-        for name, returns in returns_of.items()
-    ]
-
-
-def _half_width(returns: Sequence[float]) -> float | None:
-    """Half the width of the 95 % interval of a mean, by Student's t; None if returns do not show how they vary."""
-    if len(set(returns)) < 2:
-        return None
-    from scipy.special import stdtrit
-
-    return float(stdtrit(len(returns) - 1, 0.975)) * stdev(returns) / math.sqrt(len(returns))
+    rows = []
+    for name, returns in returns_of.items():
+        mean = interval_of_mean(np.array(returns)) if returns else None
+        # Equal returns do not show how they vary.
+        half = None if mean is None or len(set(returns)) < 2 else number(mean.high - mean.value)
+        known = {"mean": mean and number(mean.value), "half": half, "predicted": predicted.get(name)}
+        rows.append({"name": name, "n": len(returns), "returns": returns[-_MOST_RETURNS:], **known})
+    return rows

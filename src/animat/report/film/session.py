@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from animat.closed_loop.header import read_header
+from animat.closed_loop.outline import Episode, Outline
 from animat.closed_loop.session import LOG_FILE, expect_session_log, read_session
 from animat.closed_loop.tick import Tick
 from animat.errors import InvalidArgument, UnusableData
@@ -94,24 +95,22 @@ class _Reading:
         self.pulses_s: list[float] = []
         self.stop_s = 0.0
         self._conditions, self._window_s, self._turns = conditions, window_s, Counter[str]()
-        self._starts: dict[int, tuple[float, ...]] = {}
+        self._outline = Outline()
 
     def add(self, fields: dict[str, Any]) -> None:
-        if fields["kind"] == "start":
-            self._starts[fields["episode"]] = tuple(fields["observation"])
-        elif fields["kind"] == "seen":
-            if fields.get("start_s") is not None:
-                self.stop_s = max(self.stop_s, fields["start_s"] + fields["duration_s"])
-            if fields["tick"]:
-                self._add_tick(Tick.from_dict(fields["tick"]))
+        episode = self._outline.add(fields)
+        if fields["kind"] == "seen" and fields.get("start_s") is not None:
+            self.stop_s = max(self.stop_s, fields["start_s"] + fields["duration_s"])
+        if episode is not None:
+            self._add_tick(Tick.from_dict(fields["tick"]), episode)
 
-    def _add_tick(self, tick: Tick) -> None:
+    def _add_tick(self, tick: Tick, episode: Episode) -> None:
         if NOTHING not in tick.patterns:
             self.pulses_s += tick.pulse_time_s
         if not self.moments or self.moments[-1].episode != tick.episode:
             # If a session ends before the robot moves, only its start is known.
-            turn, start = self._turns[tick.agent], self._starts.get(tick.episode, ())
-            self.moments.append(Moment(tick.read_after_s, tick.agent, tick.episode, -1, turn, start))
+            turn = self._turns[tick.agent]
+            self.moments.append(Moment(tick.read_after_s, tick.agent, tick.episode, -1, turn, episode.start))
             self._turns[tick.agent] += 1
         before = self.moments[-1]
         moment = replace(
@@ -120,7 +119,7 @@ class _Reading:
             iteration=tick.iteration,
             observation=tick.observation or before.observation,
             command=tick.command,
-            total=before.total + (tick.reward or 0.0),
+            total=episode.total,
             delivered=self._conditions[tick.delivered] if tick.pulse_time_s else "",
             rate_hz=tick.rate_hz,
         )
