@@ -838,6 +838,11 @@ def test_an_error_of_an_argument_begins_with_its_option(
         ),
         (["train", "--robot", "pole"], 2, ["animat: robot: expected only its value, got --robot before it; see"]),
         (["train", "--seed=3", "--policies"], 2, ["animat: --policies: expected a value after it, got none; see"]),
+        (
+            ["record", "--out", "-a"],
+            2,
+            ["--out: expected a value after it, got one that begins with a dash: write --out="],
+        ),
         (["convert", "a.csv"], 2, ["animat: --out: expected a value, got none; see animat convert --help"]),
         (["convert"], 2, ["animat: recording: expected a value, got none; see animat convert --help"]),
         (["cluster"], 2, ["animat: where: expected a value, got none; see animat cluster --help"]),

@@ -247,8 +247,9 @@ def _parse(arguments: list[str]) -> Command:
         if message.startswith("Missing from "):
             message = f"{message.partition(': ')[2].split()[0]}: expected a value, got none"
         if message.startswith("Missing value for argument '"):
-            _, option, _ = message.split("'")
-            message = f"{option}: expected two numbers, got one"
+            _, option, expected = message.split("'")
+            dash = f"a value after it, got one that begins with a dash: write {option}=VALUE"
+            message = f"{option}: expected {'two numbers, got one' if ' 2 ' in expected else dash}"
         if message.startswith("{") or message.partition(":")[0].isupper():
             # The choices or the kind of a positional argument, in place of its name.
             named = next(field.name for field in fields if "Positional" in str(field.type))
