@@ -1035,3 +1035,16 @@ def test_output_that_is_closed_is_no_error_and_a_full_disk_is_reported_in_a_line
         )
     message = "animat: standard output: cannot be written: No space left on device\n"
     assert (done.returncode, done.stderr) == (1, message)
+
+
+@pytest.mark.parametrize("is_disk", [True, False])
+def test_a_log_on_a_full_disk_or_that_nobody_reads_ends_no_command(is_disk: bool) -> None:
+    if is_disk and not Path("/dev/full").exists():
+        pytest.skip("no /dev/full here")
+    read, write = os.pipe()
+    os.close(read)
+    with open("/dev/full" if is_disk else write, "w") as log:  # noqa: PTH123 - a pipe has no path
+        # An error of the log would have another status.
+        assert subprocess.run([sys.executable, "-m", "animat", "trian"], stderr=log).returncode == 2
+    if is_disk:
+        os.close(write)

@@ -32,6 +32,7 @@ from animat.cli.replay import Replay
 from animat.cli.reproduce import Reproduce
 from animat.cli.robots import Robots
 from animat.cli.run import Run
+from animat.cli.streams import prepare_streams
 from animat.cli.study import StudyFile
 from animat.cli.train import Train
 from animat.cli.tune import TuneFile
@@ -82,12 +83,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     or a kill; 141 if standard output is no longer read.
     """
     stay_on_cores()
-    # Closed streams are None, which the parser and others do not expect: discard what is written to them.
-    sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115, PTH123
-    sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115, PTH123
-    if isinstance(sys.stdout, io.TextIOWrapper):
-        # A character that the encoding lacks, such as an accent in a name in ASCII, is printed as a question mark.
-        sys.stdout.reconfigure(errors="replace")
+    prepare_streams()
     try:
         try:
             return _run(sys.argv[1:] if arguments is None else list(arguments))
