@@ -1048,3 +1048,16 @@ def test_a_log_on_a_full_disk_or_that_nobody_reads_ends_no_command(is_disk: bool
         assert subprocess.run([sys.executable, "-m", "animat", "trian"], stderr=log).returncode == 2
     if is_disk:
         os.close(write)
+
+
+def test_a_working_folder_that_is_gone_is_named_and_not_a_recording(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    np.savez(tmp_path / "a.npz", spike_time_s=[0.5, 2.5], spike_channel=[0, 1], stimulus_time_s=[])
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    assert main(["inspect", str(tmp_path / "a.npz")]) == 1
+    assert capsys.readouterr().err == (
+        "animat: working folder: expected one, got none (No such file or directory): cd to one that exists\n"
+    )

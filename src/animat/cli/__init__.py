@@ -112,6 +112,13 @@ def _run(arguments: list[str]) -> int:
     except InvalidArgument as error:
         print(f"animat: {error}", file=sys.stderr)
         return 2
+    try:
+        Path.cwd()
+    except OSError as error:
+        # Libraries ask for it, and what they cannot do without it would be blamed on a recording.
+        got = f"expected one, got none ({error.strerror}): cd to one that exists"
+        print(f"animat: working folder: {got}", file=sys.stderr)
+        return 1
     if "" not in sys.path:
         # As for `python -m animat`: the working folder may hold the user's own robots.
         sys.path.append("")
