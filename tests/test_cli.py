@@ -838,6 +838,11 @@ def test_an_error_of_an_argument_begins_with_its_option(
         ),
         (["train", "--robot", "pole"], 2, ["animat: robot: expected only its value, got --robot before it; see"]),
         (["train", "--seed=3", "--policies"], 2, ["animat: --policies: expected a value after it, got none; see"]),
+        (
+            ["record", "--out", "-a"],
+            2,
+            ["--out: expected a value after it, got one that begins with a dash: write --out="],
+        ),
         (["convert", "a.csv"], 2, ["animat: --out: expected a value, got none; see animat convert --help"]),
         (["convert"], 2, ["animat: recording: expected a value, got none; see animat convert --help"]),
         (["cluster"], 2, ["animat: where: expected a value, got none; see animat cluster --help"]),
@@ -1030,3 +1035,29 @@ def test_output_that_is_closed_is_no_error_and_a_full_disk_is_reported_in_a_line
         )
     message = "animat: standard output: cannot be written: No space left on device\n"
     assert (done.returncode, done.stderr) == (1, message)
+
+
+@pytest.mark.parametrize("is_disk", [True, False])
+def test_a_log_on_a_full_disk_or_that_nobody_reads_ends_no_command(is_disk: bool) -> None:
+    if is_disk and not Path("/dev/full").exists():
+        pytest.skip("no /dev/full here")
+    read, write = os.pipe()
+    os.close(read)
+    with open("/dev/full" if is_disk else write, "w") as log:  # noqa: PTH123 - a pipe has no path
+        # An error of the log would have another status.
+        assert subprocess.run([sys.executable, "-m", "animat", "trian"], stderr=log).returncode == 2
+    if is_disk:
+        os.close(write)
+
+
+def test_a_working_folder_that_is_gone_is_named_and_not_a_recording(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    np.savez(tmp_path / "a.npz", spike_time_s=[0.5, 2.5], spike_channel=[0, 1], stimulus_time_s=[])
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    assert main(["inspect", str(tmp_path / "a.npz")]) == 1
+    assert capsys.readouterr().err == (
+        "animat: working folder: expected one, got none (No such file or directory): cd to one that exists\n"
+    )

@@ -755,6 +755,22 @@ def test_a_disk_that_is_full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
         LogWriter(tmp_path / "other.log", {})
 
 
+def test_a_log_that_is_removed_ends_the_session(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("animat.closed_loop.running._SYNC_S", 0.01)
+
+    def slowly(culture: FakeCulture, observed: Observed) -> Observed:
+        culture._at += 1
+        (tmp_path / "session.log").unlink(missing_ok=True)
+        time.sleep(0.002)
+        return observed
+
+    with FakeCulture(fault=slowly, at=0) as culture:
+        session = run(tmp_path, culture, robot=LONG)
+        assert session.ending.by == "disk"
+        assert session.ending.message.startswith("the log cannot be written: it was removed")
+        assert culture.halted and culture.after_halt == 0
+
+
 def test_the_log_is_flushed_to_disk_before_the_first_pulse_meanwhile_and_at_the_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

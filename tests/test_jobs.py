@@ -313,6 +313,12 @@ def test_a_task_at_work_elsewhere_is_waited_for_unless_it_is_frozen(
     assert (tmp_path / "a").read_text() == "(a)"
 
 
+def test_a_folder_that_is_gone_may_have_been_removed_or_be_out_of_sight(tmp_path: Path) -> None:
+    gone = tmp_path / "gone"
+    with pytest.raises(InvalidFile, match=r"gone: expected .* does not see it, or it was removed during the work"):
+        carry_out_alone(Join("a"), gone, gone / ".notices" / "a")
+
+
 def children() -> list[int]:
     return [int(pid) for file in Path("/proc/self/task").glob("*/children") for pid in file.read_text().split()]
 

@@ -270,6 +270,13 @@ def test_what_is_not_there_is_refused(tmp_path: Path) -> None:
     refused(tmp_path, "*.safetensors", "got none")
 
 
+def test_what_may_not_be_read_is_refused_for_that(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # safetensors calls it missing. Root may read everything, so the answer of the system is given here.
+    path = resaved(tmp_path)
+    monkeypatch.setattr("os.access", lambda asked, mode: asked != path)
+    refused(path, "cannot be read: Permission denied")
+
+
 @pytest.mark.parametrize("kept", [0, 7, 8, 100, -1])
 def test_a_truncated_file_is_refused(kept: int, tmp_path: Path) -> None:
     path = tmp_path / "p0.safetensors"

@@ -160,6 +160,18 @@ def test_without_any_locks_the_block_still_runs(tmp_path: Path, monkeypatch: pyt
         assert not any((tmp_path / "b").iterdir())
 
 
+def test_a_link_to_a_missing_place_is_named_with_that_place(tmp_path: Path) -> None:
+    # Such as a drive that is not mounted.
+    (tmp_path / "data").symlink_to(tmp_path / "drive")
+    for folder in (tmp_path / "data", tmp_path / "data" / "culture" / "1"):
+        with (
+            pytest.raises(InvalidFile, match=r"data is a link to .*drive, which is missing; mount"),
+            exclusive_lock(folder),
+        ):
+            pass
+    assert not (tmp_path / "drive").exists()
+
+
 def test_a_block_that_fails_leaves_no_empty_folder_behind(tmp_path: Path) -> None:
     for name in ("a/b", "mine"):
         with pytest.raises(ValueError, match="no"), exclusive_lock(tmp_path / name):

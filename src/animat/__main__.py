@@ -8,8 +8,10 @@ from animat.ctrl_c import interruptible
 
 def main() -> int:
     """Run one command (`animat.cli.main`); Ctrl-C or a kill ends it with one line, even while it is being loaded."""
-    # The user's own settings of matplotlib would change figures; if they want LaTeX, labels would have to be LaTeX.
+    # The user's own settings of matplotlib would change figures; if they want LaTeX, labels would have to be LaTeX. A
+    # backend, which no figure of ours needs, may be one that this matplotlib does not have.
     os.environ["MATPLOTLIBRC"] = os.devnull
+    os.environ.pop("MPLBACKEND", None)
     try:
         with interruptible():
             from animat.cli import main as run

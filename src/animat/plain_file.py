@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import tomllib
 from pathlib import Path
@@ -28,6 +29,9 @@ def expect_plain_file(path: str | os.PathLike[str], most_bytes: int | None = Non
         raise InvalidFile(f"{path}: expected a file, got {kind}")
     if most_bytes is not None and size > most_bytes:
         raise InvalidFile(f"{path}: expected at most {most_bytes:,} bytes, got {size:,}")
+    if not os.access(path, os.R_OK):
+        # Some readers would call it damaged, or missing.
+        raise InvalidFile(f"{path}: cannot be read: {os.strerror(errno.EACCES)}")
     return path
 
 

@@ -61,6 +61,11 @@ def expect_writable(folder: str | os.PathLike[str], option: str = "--out", room_
     existing = folder = Path(folder)
     try:
         while not existing.exists() and existing != existing.parent:
+            if existing.is_symlink():
+                missing = f"{existing} is a link to {existing.readlink()}, which is missing"
+                raise InvalidFile(
+                    f"{folder}: cannot be written: {missing}; mount or make it, or choose another {option}"
+                )
             existing = existing.parent
         # Permissions would not reveal a full disk or a read-only file system.
         with tempfile.TemporaryFile(dir=existing):

@@ -32,6 +32,7 @@ from animat.cli.replay import Replay
 from animat.cli.reproduce import Reproduce
 from animat.cli.robots import Robots
 from animat.cli.run import Run
+from animat.cli.streams import prepare_streams
 from animat.cli.study import StudyFile
 from animat.cli.train import Train
 from animat.cli.tune import TuneFile
@@ -82,12 +83,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     or a kill; 141 if standard output is no longer read.
     """
     stay_on_cores()
-    # Closed streams are None, which the parser and others do not expect: discard what is written to them.
-    sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115, PTH123
-    sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115, PTH123
-    if isinstance(sys.stdout, io.TextIOWrapper):
-        # A character that the encoding lacks, such as an accent in a name in ASCII, is printed as a question mark.
-        sys.stdout.reconfigure(errors="replace")
+    prepare_streams()
     try:
         try:
             return _run(sys.argv[1:] if arguments is None else list(arguments))
@@ -116,6 +112,13 @@ def _run(arguments: list[str]) -> int:
     except InvalidArgument as error:
         print(f"animat: {error}", file=sys.stderr)
         return 2
+    try:
+        Path.cwd()
+    except OSError as error:
+        # Libraries ask for it, and what they cannot do without it would be blamed on a recording.
+        got = f"expected one, got none ({error.strerror}): cd to one that exists"
+        print(f"animat: working folder: {got}", file=sys.stderr)
+        return 1
     if "" not in sys.path:
         # As for `python -m animat`: the working folder may hold the user's own robots.
         sys.path.append("")
@@ -247,8 +250,9 @@ def _parse(arguments: list[str]) -> Command:
         if message.startswith("Missing from "):
             message = f"{message.partition(': ')[2].split()[0]}: expected a value, got none"
         if message.startswith("Missing value for argument '"):
-            _, option, _ = message.split("'")
-            message = f"{option}: expected two numbers, got one"
+            _, option, expected = message.split("'")
+            dash = f"a value after it, got one that begins with a dash: write {option}=VALUE"
+            message = f"{option}: expected {'two numbers, got one' if ' 2 ' in expected else dash}"
         if message.startswith("{") or message.partition(":")[0].isupper():
             # The choices or the kind of a positional argument, in place of its name.
             named = next(field.name for field in fields if "Positional" in str(field.type))

@@ -10,6 +10,7 @@ read, and the lost bytes are counted.
 
 from __future__ import annotations
 
+import errno
 import itertools
 import json
 import os
@@ -83,8 +84,10 @@ class LogWriter:
         return Log(self._path, self._header, self._places, 0)
 
     def sync(self) -> None:
-        """Flush the file to disk, against a power cut."""
+        """Flush the file to disk, against a power cut; raises OSError too if it was removed, which no write would."""
         os.fsync(self._file)
+        if os.fstat(self._file).st_nlink == 0:
+            raise FileNotFoundError(errno.ENOENT, "it was removed")
 
     def close(self) -> None:
         os.close(self._file)

@@ -64,7 +64,8 @@ def carry_out_alone(task: Task, folder: Path, notice: Path) -> TaskResult:
     """`carry_out` once no other process is doing so, as a worker may not notice that its client was killed."""
     if not notice.parent.is_dir():
         raise InvalidFile(
-            f"{folder}: expected a folder that all workers see, at the same place; {platform.node()} does not see it"
+            f"{folder}: expected a folder that all workers see, at the same place; {platform.node()} does not see it, "
+            "or it was removed during the work"
         )
     with notice.with_suffix(".lock").open("a") as lock, _holding(lock):
         return carry_out(task, folder, notice)
