@@ -103,10 +103,8 @@ def mann_whitney(first: Float64[np.ndarray, " n"], second: Float64[np.ndarray, "
         # From 1.18 on SciPy returns NaN.
         return len(first) * len(second) / 2, 1.0
     test = mannwhitneyu(first, second, alternative="two-sided", method="asymptotic")
-    # Of values that are all equal SciPy 1.18.1 knows no p.
-    p = 1.0 if np.ptp(np.concatenate([first, second])) == 0 else float(test.pvalue)
     # Of groups of hundreds p can underflow to 0.
-    return float(test.statistic), max(p, sys.float_info.min)
+    return float(test.statistic), max(float(test.pvalue), sys.float_info.min)
 
 
 def p_of_u(u: float, n_first: int, n_second: int) -> float:
