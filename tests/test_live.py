@@ -336,7 +336,7 @@ class Pressing:
     """A progress at which a person presses Ctrl-C once there was a swap."""
 
     def update(self, done: float, total: float, note: str = "") -> None:
-        if "1 swaps" in note:
+        if ", 1 swap" in note:
             raise KeyboardInterrupt
 
 
@@ -363,7 +363,7 @@ def test_ctrl_c_keeps_recordings_and_policies_and_stops_the_culture(
     assert not (tmp_path / "live" / ".exchange").exists()
     assert len(read_recordings([tmp_path / "live" / "recordings"])) >= 2
     events = lines(tmp_path / "live")
-    assert [line["what"] for line in events[-2:]] == ["interrupted", "end"]
+    assert [line["what"] for line in events if line["what"] in ("interrupted", "end")] == ["interrupted", "end"]
     assert events[-1]["budget"]["pulses"] == culture.pulses
     assert events[-2]["message"] == "stopped by a person"
     with pytest.raises(Mismatch, match="expected an empty folder for a live run, got one with files"):
@@ -383,7 +383,7 @@ def test_a_culture_that_fails_meanwhile_is_stopped_and_what_was_trained_is_kept(
         # The second recording was handed over: nobody knows what came of it.
         assert lines(tmp_path / "live")[-1]["budget"]["pulses"] == culture.pulses == 2 * PULSES
     events = lines(tmp_path / "live")
-    assert [line["what"] for line in events[-2:]] == ["fault", "end"]
+    assert [line["what"] for line in events if line["what"] in ("fault", "end")] == ["fault", "end"]
     assert events[-2]["message"] == "DeviceFailed: gone"
     policies = load_policies(tmp_path / "live" / "policies")
     assert list(policies) == ["p0"]
@@ -595,7 +595,7 @@ def test_from_the_command_line_it_says_what_it_did_and_exits_as_the_loop_ended(
     printed = capsys.readouterr().out.splitlines()
     results = json.loads(printed[-1])
     assert printed[0].startswith("2 recordings in 10 min of the culture's clock (")
-    assert printed[0].endswith("1 swaps of simulators:")
+    assert printed[0].endswith("1 swap of simulators:")
     assert f"{results['iterations']:,} iterations of each policy without a pause" in printed[0]
     assert "policies p0 to p1 after" in printed[1]
     assert "the recording at 5.2 min" in printed[1]

@@ -94,8 +94,11 @@ def test_the_best_of_many_conditions_is_found() -> None:
 @pytest.mark.parametrize(("limit", "truth"), [(1, 0.0), (2, 0.36), (3, 0.36), (4, 0.36 + 2 * 0.24 * 0.36)])
 def test_short_horizons_by_hand(limit: int, truth: float) -> None:
     """Two up, or one down on the way: p p, then (p q + q p) p p more."""
-    found = best_return(Animat(Stairs(limit), Thresholds(1), 2), coins(3, 6), grid=STEPS, episodes=0)
-    assert found.value == pytest.approx(truth, abs=1e-5)
+    better = Animat(Stairs(limit), Thresholds(1), 2), coins(3, 6)
+    # Beside cases of other values, with fewer actions and outcomes, each has its own.
+    head = Animat(Stairs(limit), Thresholds(1), 1), coins(10)
+    found = best_returns([head, better, head], grid=STEPS, episodes=0)
+    assert [each.value for each in found] == pytest.approx([float(limit > 1), truth, float(limit > 1)], abs=1e-5)
 
 
 @dataclass(frozen=True)
@@ -115,6 +118,10 @@ def test_noise_of_the_robot_is_averaged_over() -> None:
     found = best_return(WithoutNeurons(Lottery(), None), None, grid=STEPS)
     assert found.value == pytest.approx(2 * (1 + 1 / 4), abs=1e-5)
     assert abs(found.monte_carlo - found.value) < 4 * found.standard_error
+    # What can only lose loses as much beside what has more to choose from.
+    losing, either = ((Animat(Lottery(), Thresholds(1), len(heads)), coins(*heads)) for heads in ((0,), (0, 10)))
+    values = [each.value for each in best_returns([losing, either], grid=STEPS, episodes=0)]
+    assert values == pytest.approx([2 * (-1 + 1 / 4), 2 * (1 + 1 / 4)], abs=1e-5)
 
 
 @dataclass(frozen=True)

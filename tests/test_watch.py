@@ -23,6 +23,7 @@ from animat.closed_loop.log import LogWriter, Record, read_log
 from animat.closed_loop.session import LOG_FILE, read_session
 from animat.closed_loop.tick import STOP_FILE
 from animat.errors import InvalidArgument, InvalidFile
+from animat.progress import format_duration
 from animat.robots import Navigation
 from animat.robots.drawing import draw_robot
 from animat.watch.session import SessionView, _in_force, stop_session
@@ -63,7 +64,9 @@ def test_the_numbers_of_the_page_are_those_of_the_table(folder: Path) -> None:
         assert ticks["reward"][i] == (float(row["reward"]) if row["reward"] else None)
         observed = [row[name] for name in about["observed"]]
         assert ticks["observation"][i] == ([float(each) for each in observed] if observed[0] else [])
-    assert (found["state"], found["damage"]) == ("ended", "")
+        earlier = [row["reward"] for row in rows[: i + 1] if row["episode"] == rows[i]["episode"]]
+        assert ticks["total"][i] == sum(float(reward) for reward in earlier if reward)
+    assert (found["state"], found["damage"], found["strange"], found["n_faults"]) == ("ended", "", 0, 0)
 
 
 def test_thresholds_from_before_the_span_are_shown(folder: Path, tmp_path: Path) -> None:
@@ -83,7 +86,16 @@ def test_thresholds_from_before_the_span_are_shown(folder: Path, tmp_path: Path)
     assert adapted[0][0] < found["from_s"]
 
 
-def test_the_picture_shows_the_robot_with_the_path_of_its_episode(folder: Path) -> None:
+def test_the_picture_shows_the_robot_with_the_path_of_its_episode(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    commands = []
+
+    def drawn(*shown: Any, command: Any, **more: Any) -> Any:
+        commands.append(command)
+        return draw_robot(*shown, command=command, **more)
+
+    monkeypatch.setattr("animat.watch.session.draw_robot", drawn)
     view = SessionView(folder)
     ticks = whole(view)["ticks"]
     rows = [i for i, observation in enumerate(ticks["observation"]) if observation]
@@ -94,6 +106,7 @@ def test_the_picture_shows_the_robot_with_the_path_of_its_episode(folder: Path) 
     expected = draw_robot(Navigation(episode_limit=6), now, command=command, earlier=earlier)
     picture = view.picture(view.view(ticks["time_s"][own[-1]], 1.0)["picture"])
     assert picture is not None and len(own) == 4
+    assert commands == [command] and command
     np.testing.assert_array_equal(np.asarray(Image.open(io.BytesIO(picture)).convert("RGB")), expected)
 
 
@@ -162,13 +175,26 @@ def test_a_log_is_followed_while_it_grows(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(InvalidFile, match="cannot be read"):
         view.about()
     writer = LogWriter(tmp_path / LOG_FILE, log.header)
-    ticks = 0
+    writer.append(Record({"kind": "event", "what": "culture", "message": "gone", "asked_at_s": 1.5}))
+    ticks, end_s, moved_at = 0, 0.0, None
     for number, record in enumerate(log):
-        writer.append(record)
-        ticks += bool(record.fields.get("tick"))
+        fields = record.fields
+        if fields.get("tick"):
+            ticks += 1
+            moved_at = moved_at or (None if fields["tick"]["handled"] == "warm-up" else ticks)
+            fields = {**fields, "tick": {**fields["tick"], "wall_s": 10_000.0 + 60 * ticks}}
+        writer.append(record._replace(fields=fields))
+        if fields["kind"] == "seen":
+            end_s = fields["start_s"] + fields["duration_s"]
         if number % 7 == 0:
             found = whole(view)
-            assert found["n_ticks"] == ticks
+            assert (found["n_ticks"], found["end_s"]) == (ticks, end_s)
+            assert (found["n_faults"], found["faults"]) == (1, [(1.5, "culture: gone")])
+            done = found["episodes_done"]
+            assert sum(agent["n"] for agent in found["agents"]) == done
+            if done and found["state"] == "running":
+                left_s = 60 * (ticks - moved_at) * (4 - done) / done
+                assert found["time_left"] == format_duration(left_s)
             assert not found["damage"]
             assert found["state"] == ("running" if record.fields["kind"] != "end" else "ended")
     writer.close()

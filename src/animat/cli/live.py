@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from tyro.conf import Positional
 
 from animat.cli.command import StimulationOptions, expect_no_fault, read_sac
-from animat.errors import InvalidArgument
+from animat.errors import InvalidArgument, counted
 from animat.writing import exclusive_lock
 
 if TYPE_CHECKING:
@@ -140,9 +140,9 @@ class Live(StimulationOptions):
         from animat.execution.training import as_range
 
         print(
-            f"{len(ran.recordings)} recordings in {ran.culture_min:.0f} min of the culture's clock "
+            f"{counted(len(ran.recordings), 'recording')} in {ran.culture_min:.0f} min of the culture's clock "
             f"({ran.wall_s:.0f} s of real time); {ran.iterations:,} iterations of each policy without a pause; "
-            f"{len(ran.swaps)} swaps of simulators:"
+            f"{counted(len(ran.swaps), 'swap')} of simulators:"
         )
         for swap in ran.swaps:
             print(
