@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import multiprocessing
@@ -12,7 +13,7 @@ import shutil
 import signal
 import time
 from collections.abc import Iterator
-from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -317,6 +318,21 @@ def test_a_folder_that_is_gone_may_have_been_removed_or_be_out_of_sight(tmp_path
     gone = tmp_path / "gone"
     with pytest.raises(InvalidFile, match=r"gone: expected .* does not see it, or it was removed during the work"):
         carry_out_alone(Join("a"), gone, gone / ".notices" / "a")
+
+
+def test_too_many_open_files_are_not_taken_for_too_little_memory(tmp_path: Path) -> None:
+    class Full(ThreadPoolExecutor):
+        def submit(self, *_: Any, **__: Any) -> Any:
+            future: Future[Any] = Future()
+            future.set_exception(OSError(errno.EMFILE, os.strerror(errno.EMFILE)))
+            return future
+
+    with (
+        Full() as executor,
+        pytest.raises(AnimatError, match=r"job: .*Too many open files \(.*`ulimit -n` raises") as raised,
+    ):
+        run([Job("job", Join("a"))], tmp_path, executor)
+    assert "memory" not in str(raised.value)
 
 
 def children() -> list[int]:

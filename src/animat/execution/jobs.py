@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import math
 import signal
@@ -232,4 +233,6 @@ def _expect_success(future: Future[TaskResult], job: Job) -> None:
         # SIGTERM comes from a person or a program; the kernel uses SIGKILL when memory runs out.
         is_terminated = message.endswith(f"status {-signal.SIGTERM}")
         why = "another program ended it" if is_terminated else f"is there enough memory? {memory_of(job.task)}"
+        if isinstance(error, OSError) and error.errno == errno.EMFILE:
+            why = "fewer --workers need fewer, and `ulimit -n` raises the limit"
         raise AnimatError(f"{job.name}: {message} ({why}); run again to continue") from error
