@@ -250,6 +250,8 @@ def test_a_file_ends_a_session_whose_culture_is_still_answering(tmp_path: Path, 
             session = run(tmp_path, culture, robot=LONG)
             assert session.ending.by == "person"
             assert_safe(session, culture, 7)
+            # Not again while it is waited for.
+            assert [each.fields["kind"] for each in session.log][-3:].count("asked") == 1
         finally:
             released.set()
 

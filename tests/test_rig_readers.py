@@ -275,7 +275,12 @@ def test_cl1_spikes_and_stimuli_with_parameters_from_the_data_stream(tmp_path: P
         spikes=[(start + 50_000, 8), (start + 25_000, 62)],
         stims=[(start + 1000, 9), (start + 1000, 12), (start + 6000, 9), (start + 11_000, 20)],
         # The second text is longer than a byte can say. Entries are in any order.
-        stream=[(start + 10_000, packed_text(said(40, 1) + 300 * " ")), (start + 990, packed_text(said(5, 0)))],
+        # Of two at the same time, the later one applies.
+        stream=[
+            (start + 10_000, packed_text(said(40, 1) + 300 * " ")),
+            (start + 990, packed_text(said(20, 0))),
+            (start + 990, packed_text(said(5, 0))),
+        ],
         start=start,
         mark=mark,
     )
@@ -322,9 +327,18 @@ def test_cl1_without_stream_stimuli_or_spikes(tmp_path: Path) -> None:
     recording = read_recording(write_cl1(tmp_path / "a.h5", spikes=[(5, 1)], stims=[(1, 2)]))
     assert np.isnan(recording.stimuli.frequency_hz).all()
     assert len(read_recording(write_cl1(tmp_path / "b.h5", spikes=[(5, 1)], stims=None)).stimuli) == 0
-    # Longer than the rig had run before: its frames cannot be told from those of a recording that begins with 0.
-    long = read_recording(write_cl1(tmp_path / "d.h5", spikes=[(50_000, 1)], stims=[(25_000, 2)], start=20_000))
-    assert (long.spike_times_s.tolist(), long.stimuli.time_s.tolist()) == ([2.0], [1.0])
+    for start, spike, stimulus, times_s in (
+        # Longer than the rig had run before: its frames cannot be told from those of a recording that begins with 0.
+        (20_000, 50_000, 25_000, (2.0, 1.0)),
+        (100_000, 250_000, 150_000, (10.0, 6.0)),
+        # A spike in the first frame.
+        (240_000, 240_000, 260_000, (0.0, 0.8)),
+        # Frames beyond the end do not count from the start of the rig if others lie before it.
+        (50_000, 260_000, 25_000, (10.4, 1.0)),
+    ):
+        path = write_cl1(tmp_path / "d.h5", spikes=[(spike, 1)], stims=[(stimulus, 2)], start=start)
+        recording = read_recording(path)
+        assert (recording.spike_times_s[0], recording.stimuli.time_s[0]) == times_s
     path = write_cl1(tmp_path / "c.h5", spikes=None, stims=[(1, 2)], samples=np.zeros((10, 64), "<i2"))
     with pytest.raises(InvalidFile, match=r"expected spikes at /spikes.*include_spikes=False.*animat convert --raw"):
         read_recording(path)
@@ -467,15 +481,16 @@ def test_other_nwb_columns_with_other_values_than_ours(
 
 def test_other_nwb_lasts_as_long_as_its_units_were_observed(tmp_path: Path) -> None:
     path = other_nwb(tmp_path / "a.nwb")
-    for spike_s, observed, span_s in (
-        ([105.0, 120.0, 119.0], [[101.0, 110.0], [115.0, 121.5]], (100.5, 121.5)),
+    for spike_s, stimulus_s, observed, span_s in (
+        ([105.0, 120.0, 119.0], [100.5, 110.0], [[101.0, 110.0], [115.0, 121.5]], (100.5, 121.5)),
+        ([105.0, 120.0, 119.0], [103.0, 122.0], [[101.0, 110.0], [115.0, 121.5]], (101.0, 122.0)),
         # Intervals that leave out spikes are on another clock, or of some units only.
-        ([105.0, 120.0, 129.0], [[101.0, 110.0], [115.0, 121.5]], (0.0, 129.0)),
-        ([105.0, 120.0, 119.0], [[np.nan, np.inf]], (0.0, 120.0)),
+        ([105.0, 120.0, 129.0], [100.5, 110.0], [[101.0, 110.0], [115.0, 121.5]], (0.0, 129.0)),
+        ([105.0, 120.0, 119.0], [100.5, 110.0], [[np.nan, np.inf]], (0.0, 120.0)),
     ):
         with h5py.File(path, "r+") as file:
             file["units/spike_times"][...] = spike_s
-            file["stimulus/presentation/pulses/start_time"][...] = [100.5, 110.0]
+            file["stimulus/presentation/pulses/start_time"][...] = stimulus_s
             file["units"].pop("obs_intervals", None)
             file["units/obs_intervals"] = observed
         recording = read_hdf5(path)
