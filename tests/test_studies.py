@@ -265,7 +265,7 @@ def test_a_finished_folder_that_cannot_be_written_to_is_still_finished(
         assert run_study(read_study(TINY), folder, base=TINY.parent).done_now == {}
     assert leftover.exists()
     monkeypatch.setattr(Path, "open", open_)
-    monkeypatch.setattr(os, "access", lambda path, mode: False)
+    monkeypatch.setattr(os, "access", lambda path, mode: mode == os.R_OK)
     assert run_study(read_study(TINY), folder, base=TINY.parent).done_now == {}
     (folder / "tables/scores.csv").unlink()
     with pytest.raises(InvalidFile, match=r"archive: .* left, but it cannot be written"):
