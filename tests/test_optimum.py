@@ -95,6 +95,7 @@ def test_the_best_of_many_conditions_is_found() -> None:
 def test_short_horizons_by_hand(limit: int, truth: float) -> None:
     """Two up, or one down on the way: p p, then (p q + q p) p p more."""
     better = Animat(Stairs(limit), Thresholds(1), 2), coins(3, 6)
+    assert best_return(*better, grid=STEPS, episodes=0).value == pytest.approx(truth, abs=1e-5)
     # Beside cases of other values, with fewer actions and outcomes, each has its own.
     head = Animat(Stairs(limit), Thresholds(1), 1), coins(10)
     found = best_returns([head, better, head], grid=STEPS, episodes=0)

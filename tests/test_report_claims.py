@@ -181,6 +181,7 @@ def test_a_comparison_is_explained_by_its_optima() -> None:
     assert "below 0.03, unless some have equal returns: use more policies" in explain(replace(ROW, n=4))
     assert compare(np.zeros(4), np.ones(4)).p_normal < 0.014
     assert explain(replace(ROW, n=1)).startswith("With 1 policy per side")
+    assert "nothing to learn" in explain(replace(ROW, optimum_second=-79.8))
     assert "nothing to learn" in explain(replace(ROW, optimum_second=-79.5)), "equal within its error"
     assert "nothing to learn" not in explain(replace(ROW, optimum_second=-79.4))
     assert "no optimum" in explain(replace(ROW, optimum_second=None))

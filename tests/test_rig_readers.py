@@ -338,7 +338,7 @@ def test_cl1_without_stream_stimuli_or_spikes(tmp_path: Path) -> None:
     ):
         path = write_cl1(tmp_path / "d.h5", spikes=[(spike, 1)], stims=[(stimulus, 2)], start=start)
         recording = read_recording(path)
-        assert (recording.spike_times_s[0], recording.stimuli.time_s[0]) == times_s
+        assert (*recording.spike_times_s.tolist(), *recording.stimuli.time_s.tolist()) == times_s
     path = write_cl1(tmp_path / "c.h5", spikes=None, stims=[(1, 2)], samples=np.zeros((10, 64), "<i2"))
     with pytest.raises(InvalidFile, match=r"expected spikes at /spikes.*include_spikes=False.*animat convert --raw"):
         read_recording(path)

@@ -86,7 +86,8 @@ class LogWriter:
     def sync(self) -> None:
         """Flush the file to disk, against a power cut; raises OSError too if it was removed, which no write would."""
         os.fsync(self._file)
-        if os.fstat(self._file).st_nlink == 0:
+        # Some file systems count no links.
+        if os.fstat(self._file).st_nlink == 0 and not self._path.exists():
             raise FileNotFoundError(errno.ENOENT, "it was removed")
 
     def close(self) -> None:

@@ -26,8 +26,9 @@ COLUMNS = {
     "stimulus_presentation": ("presentation",),
     "stimulus_electrodes": ("electrode_ids", "electrode_id", "electrodes", "electrode"),
 }
-NO_STIMULUS_COLUMNS = ("id", "start_time", "stop_time", "tags", "timeseries", "timestamp", "duration", "annotation")
-"""Columns that any table of intervals or events may have."""
+NO_STIMULUS_COLUMNS = ("id", "start_time", "stop_time", "tags", "timeseries")
+OF_EVENTS = ("duration", "annotation")
+"""Columns that any table of intervals, and of events, may have."""
 ONSET_NAME = re.compile(r"stim(ulus)?_?(on|onset|start)(_?times?)?", re.IGNORECASE)
 """A column of the times at which the stimuli of trials begin, which is later than the trials themselves."""
 APART_S = 0.001
@@ -110,7 +111,7 @@ def _of_table(file: Hdf5File, at: str, times: str, findings: list[Finding]) -> d
     """The columns of a table of intervals or events, with the times of the stimuli in the column `times`."""
     time_s = file.read(f"{at}/{times}").reshape(-1)
     columns: dict[str, Any] = {"stimulus_time_s": time_s}
-    used = {*NO_STIMULUS_COLUMNS, times}
+    used = {*NO_STIMULUS_COLUMNS, times, *(OF_EVENTS if times == "timestamp" else ())}
     for column, names in COLUMNS.items():
         for name in names:
             if (values := _values(file, f"{at}/{name}", column, time_s)) is not None:
