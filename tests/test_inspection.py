@@ -168,7 +168,7 @@ def test_stimuli_without_a_condition_are_counted() -> None:
     # What other kinds could be had is not a list of what the recording has.
     for by in (ByElectrode(), ByInterval((7.0,)), Nothing()):
         none = message(source, "no-condition", by=by)
-        others = " or ".join(each for each in ("frequency", "interval", "electrode", "pattern") if each != str(by))
+        others = " or ".join(each for each in ("frequency", "interval:5,10", "electrode", "pattern") if each != str(by))
         assert f"none of 3 stimuli belongs to the conditions {by}: choose others (--conditions {others})" in none
 
 

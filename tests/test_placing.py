@@ -53,6 +53,7 @@ def test_recordings_of_rigs_are_placed_by_their_dates(tmp_path: Path, capsys: py
     assert main(["inspect", str(first), str(second), "--out", str(tmp_path / "figures"), "--json"]) == 0
     *printed, last = capsys.readouterr().out.splitlines()
     assert f"  note     placed-by-date: {note}" in printed
+    assert "  z.nwb from 0 min, a.nwb from 72.5 min" in printed
     inspected = json.loads(last)
     assert [finding["name"] for finding in inspected["together"]] == ["placed-by-date"]
     assert [each["start_min"] for each in inspected["recordings"]] == [0.0, 72.5]

@@ -433,7 +433,7 @@ def test_spikes_without_stimuli_are_read_and_reported(tmp_path: Path) -> None:
     assert len(recording.stimuli) == 0
     refusal = next(finding for finding in recording_findings(recording) if finding.name == "no-stimuli")
     assert refusal.severity == "refuse"
-    assert "1 spikes but no stimuli" in refusal.message
+    assert "1 spike but no stimuli" in refusal.message
     assert "a_stimuli.csv or a_stimuli.csv.gz was looked for" in refusal.message
 
 

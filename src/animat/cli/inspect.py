@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from tyro.conf import Positional
 
 from animat.cli.command import ResponseOptions, print_warnings
-from animat.errors import AnimatError, InvalidArgument, Mismatch, UnusableData, within
+from animat.errors import AnimatError, InvalidArgument, Mismatch, UnusableData, in_min, within
 from animat.progress import Bar, Part, Progress
 from animat.writing import expect_writable
 
@@ -101,7 +101,10 @@ class Inspect(ResponseOptions):
                 each["start_min"] = responses.start_min
             placed = {finding for each in of_files for finding in each.findings if finding.name == "placed-by-date"}
             if together := [*placed, *unlike_finding(of_files), *series_findings(of_files)]:
-                print("\n".join(["all together:", *finding_lines(together)]), end="\n\n")
+                # Above, each file was printed with the start that it states.
+                starts = ", ".join(f"{each['name']} from {in_min(each['start_min'])}" for each in inspected)
+                lines = ["all together:", *([f"  {starts}"] if placed else []), *finding_lines(together)]
+                print("\n".join(lines), end="\n\n")
             results["together"] = [{**finding.to_dict(), "value": finding.value} for finding in together]
             if self.out is not None and series:
                 progress.update(total - 1, total, "figures of the series")

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from animat.errors import some_of
+from animat.errors import counted, some_of
 from animat.recordings.findings import Finding
 from animat.recordings.recording import Recording, ResponseTable
 from animat.recordings.time_quality import frequency_findings, silences, time_findings
@@ -43,7 +43,7 @@ def _in_data(recording: Recording) -> Iterable[Finding]:
     channels, stimuli = recording.channels, recording.stimuli
     if not len(stimuli):
         n = len(recording.spike_times_s)
-        message = f"{n:,} spikes but no stimuli: no responses to learn from; provide the stimulus times too"
+        message = f"{counted(n, 'spike')} but no stimuli: no responses to learn from; provide the stimulus times too"
         yield Finding("no-stimuli", "refuse", message)
     if not len(recording.spike_times_s):
         yield Finding("no-spikes", "refuse", f"no spike on any of {len(channels):,} channels: nothing can be learned")

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from animat.errors import InvalidFile, did_you_mean, in_file, some_of
+from animat.errors import InvalidFile, counted, did_you_mean, in_file, some_of
 from animat.recordings.columns import REQUIRED, Column, PlainColumns
 from animat.recordings.findings import Finding
 from animat.recordings.formats.text_table import TextTable, as_numbers, folded, is_number, read_table, whole_numbers
@@ -49,7 +49,7 @@ def read_csv(table: TextTable, stimuli_path: str | os.PathLike[str] | None = Non
     if stimuli is None:
         columns["stimulus_time_s"] = np.empty(0)
         looked_for = " or ".join(file.name for file in _stimuli_beside(path))
-        found = f"{len(table.rows):,} spikes but no stimuli, so there are no responses to learn from"
+        found = f"{counted(len(table.rows), 'spike')} but no stimuli, so there are no responses to learn from"
         message = f"{path.name} has {found}: {looked_for} was looked for; rename the stimulus file accordingly"
         findings = [*findings, Finding("no-stimuli", "refuse", message)]
     else:

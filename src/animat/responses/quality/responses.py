@@ -96,7 +96,7 @@ def _left_out(
         kind = by.partition(":")[0]
         occurring = conditions_named(kind).assign(stimuli).conditions if kind in _NAMED_ALONE else ()
         known = f"; the recording has {some_of([each.label for each in occurring])}" if occurring else ""
-        others = " or ".join(each for each in ("frequency", "interval", "electrode", "pattern") if each != by)
+        others = " or ".join(each for each in ("frequency", "interval:5,10", "electrode", "pattern") if each != by)
         message = (
             f"none of {n_read:,} stimuli belongs to the conditions {by}{known}: choose others (--conditions {others})"
         )
