@@ -721,3 +721,20 @@ def test_traces_far_from_0_make_a_recording_of_their_span(tmp_path: Path) -> Non
     assert (before.start_s, before.stop_s) == (-3600.0, -3599.0)
     # Without an electrodes table all channels are known all the same.
     assert "silent-channels-unknown" not in {finding.name for finding in recording.findings}
+
+
+def test_a_channel_that_occurs_twice_is_read_from_its_first_column_with_its_conversion(tmp_path: Path) -> None:
+    voltage, _ = noisy(3, 0.1, step_uv=1.0)
+    write_nwb_traces(tmp_path / "a.nwb", voltage, start_s=0.0)
+    with h5py.File(tmp_path / "a.nwb", "r+") as file:
+        table = file.create_group("general/extracellular_ephys/electrodes")
+        table["id"], table["rel_x"], table["rel_y"] = [7, 8, 9, 10], np.arange(4.0), np.zeros(4)
+        file["acquisition/traces/electrodes"] = [2, 2, 0]
+        file["acquisition/traces/channel_conversion"] = [2.0, 3.0, 5.0]
+    traces, _ = open_traces(tmp_path / "a.nwb")
+    assert traces.channels.label.tolist() == ["9", "7"]
+    np.testing.assert_allclose(traces.read_uv(3, 9), voltage[3:9, [0, 2]] * np.array([2.0, 5.0]), rtol=1e-6)
+    with h5py.File(tmp_path / "a.nwb", "r+") as file:
+        del file["acquisition/traces/starting_time"].attrs["rate"]
+    with pytest.raises(InvalidFile, match="expected timestamps of /acquisition/traces, or a rate in Hz"):
+        open_traces(tmp_path / "a.nwb")

@@ -15,7 +15,7 @@ import pytest
 from animat.coding.mapping import Linear, Thresholds
 from animat.environment import Animat, WithoutNeurons
 from animat.errors import InvalidArgument, Mismatch
-from animat.evaluation.commands import commands_of
+from animat.evaluation.commands import Commands, commands_of, nodes_for
 from animat.evaluation.optimum import best_return, best_returns, bracket_findings
 from animat.evaluation.rollouts import Constant, Uniform, roll_out
 from animat.evaluation.sweeping import bellman_backup, cubic, look_ahead
@@ -418,3 +418,19 @@ def test_refusals_say_what_to_do() -> None:
     )
     with pytest.raises(InvalidArgument, match="first coordinate"):
         best_return(environment, SIMULATOR, grid=turned)
+
+
+def test_the_mean_of_any_function_comes_from_the_fewest_commands() -> None:
+    rare = Commands(np.arange(2), np.array([[-1.0, 0.4], [0.4, 0.9]]), np.array([[0.5, 0.5], [1.0, 0.0]]))
+    # A command that never occurs needs no node, and one that differs by rounding is the same.
+    again = Commands(np.arange(1), np.array([[0.4 + 1e-9, 1.0]]), np.array([[0.5, 0.5]]))
+    nodes, are_smooth = nodes_for([rare, again], None)
+    np.testing.assert_allclose(nodes, [-1.0, 0.4, 1.0])
+    assert not are_smooth
+    assert len(nodes_for([rare, again], 3)[0]) == 3 and not nodes_for([rare, again], 3)[1]
+    many = Commands(np.arange(1), np.linspace(-0.5, 1.0, 40)[None], np.full((1, 40), 1 / 40))
+    nodes, are_smooth = nodes_for([many], 12)
+    assert are_smooth and len(nodes) == 12 and (nodes[0], nodes[-1]) == pytest.approx((-0.5, 1.0))
+    for each in (np.sin, np.exp, lambda u: u**5):
+        mean = (many.onto(nodes, smooth=True) @ each(nodes)).item()
+        assert mean == pytest.approx(float(np.mean(each(many.levels))), abs=1e-6)

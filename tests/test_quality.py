@@ -184,6 +184,15 @@ def test_the_error_of_a_drift_is_that_of_least_squares_with_a_mean_per_condition
     assert not list(drift_findings(responses))
 
 
+def test_bursts_have_no_part_in_a_drift() -> None:
+    plain = extract_responses(drifting(0.0, False), burst_threshold=1.0)
+    bursts = np.zeros(len(plain), np.bool_)
+    bursts[-40:] = True
+    raised = np.where(bursts, 500.0, plain.rate_hz)
+    assert not list(drift_findings(replace(plain, rate_hz=raised, is_burst=bursts)))
+    assert list(drift_findings(replace(plain, rate_hz=raised)))
+
+
 def test_channels_that_fire_as_no_neurons_do() -> None:
     rng = np.random.default_rng(0)
     usual = np.column_stack([rng.uniform(0, 10, 400), rng.integers(0, 30, 400)])

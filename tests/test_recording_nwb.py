@@ -18,6 +18,7 @@ from hypothesis.extra import numpy as npst
 from animat.errors import InvalidArgument, InvalidFile
 from animat.recordings.formats.hdf5_formats import read_hdf5
 from animat.recordings.formats.nwb import write_nwb
+from animat.recordings.formats.nwb_spikes import write_spikes
 from animat.recordings.reading import read_recording
 from animat.recordings.recorded_culture import RecordedCulture
 from animat.recordings.recording import Channels, Recording
@@ -330,3 +331,16 @@ def test_provenance_that_would_read_back_differently_is_not_written(changed: dic
     with pytest.raises(InvalidArgument, match=r"^(provenance|culture): expected "):
         write_nwb(recording, tmp_path / "recording.nwb")
     assert not list(tmp_path.iterdir())
+
+
+@given(st.lists(st.lists(st.tuples(st.integers(0, 9), st.integers(0, 2)), max_size=6), max_size=5))
+def test_spikes_in_any_order_and_in_any_blocks_are_written_in_ascending_order(
+    blocks: list[list[tuple[int, int]]],
+) -> None:
+    spikes = [spike for block in blocks for spike in block]
+    arrays = [(np.array([t for t, _ in b], np.float64), np.array([c for _, c in b], np.int64)) for b in blocks]
+    counts = np.bincount([c for _, c in spikes], minlength=3)
+    with h5py.File("any.h5", "w", driver="core", backing_store=False) as file:
+        dataset = file.create_dataset("times", len(spikes), np.float64)
+        write_spikes(dataset, arrays, counts)
+        assert dataset[:].tolist() == [t for c in range(3) for t in sorted(t for t, of in spikes if of == c)]

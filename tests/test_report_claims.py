@@ -293,6 +293,9 @@ def test_decisions_follow_a_changed_study() -> None:
     assert "Ten levels without zero" not in made and "Most probable actions" not in made
     drawn = dict(decisions(replace(changed, simulators=Simulators(kind="empirical"))))
     assert "Drawing from a histogram" not in drawn and "measured responses" in drawn["Histogram"]
+    kinds = Arm("moving"), Arm("fixed", percentiles="first")
+    for arms, end in ((kinds, "they move, except in the arms with those of the first recording."), (kinds[:1], "it.")):
+        assert dict(decisions(replace(changed, arms=arms)))["Percentiles"].endswith(end)
     alone = dict(decisions(replace(changed, robots=(RobotSpec("navigation"),))))
     assert "Pole mass" not in alone
 

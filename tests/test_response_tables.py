@@ -309,3 +309,11 @@ def test_rows_without_times_drift_in_their_order(tmp_path: Path) -> None:
             # From 0.5 to 1.5 of the mean.
             assert found["drift"].value == pytest.approx(1.0, abs=0.1)
             assert "in the order of the rows" in found["drift"].message
+
+
+def test_the_trials_of_a_wide_table_are_known(tmp_path: Path) -> None:
+    (tmp_path / "a_responses.csv").write_text("trial,mood,count_a,count_b\n7,1,3,4\n8,1,5,6\n")
+    table = table_of(tmp_path / "a_responses.csv")
+    assert table.values.tolist() == [[3, 4], [5, 6]]
+    (ignored,) = [finding.message for finding in table.findings if "mood" in finding.message]
+    assert "trial" not in ignored
