@@ -127,3 +127,11 @@ def test_names_in_place_of_a_robot_and_a_mapping_are_refused() -> None:
             [sys.executable, "-c", f"import animat; animat.Animat({arguments})"], capture_output=True, text=True
         )
         assert ran.returncode and ran.stderr.rstrip().endswith(f"InvalidArgument: {message}")
+
+
+@pytest.mark.parametrize("wrong", [3, [3]])
+def test_a_list_of_pairs_is_described_as_such(wrong: Any) -> None:
+    with pytest.raises(
+        animat.InvalidArgument, match=r"^cases: expected several of: a tuple of an env.* and a sim.*, got 3$"
+    ):
+        animat.best_returns(wrong)

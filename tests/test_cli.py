@@ -22,6 +22,7 @@ import docstring_parser
 import numpy as np
 import pytest
 
+import animat
 from animat.cli import COMMANDS, main
 from animat.cli.command import print_warnings
 from animat.cli.train import Train
@@ -969,6 +970,7 @@ def test_the_worst_of_several_warnings_is_printed(
 def test_the_version_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--version"]) == 0
     assert capsys.readouterr().out == f"animat {version('animat')}\n"
+    assert animat.__version__ == version("animat")
     with pytest.raises(SystemExit):
         main(["--help"])
     assert "animat --version" in capsys.readouterr().out

@@ -357,7 +357,8 @@ def test_a_grid_that_fails_gives_the_reason() -> None:
         return 1 / 0
 
     said = "slider.value_grid: expected a Grid, got ZeroDivisionError: division by zero"
-    assert why_no_grid(slider(value_grid=broken)) == said
+    line = broken.__code__.co_firstlineno + 1
+    assert why_no_grid(slider(value_grid=broken)) == f"{said} ({Path(__file__).name}, line {line})"
 
 
 @dataclasses.dataclass(frozen=True)

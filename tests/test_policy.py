@@ -547,3 +547,13 @@ def test_what_is_read_of_a_provenance_is_what_training_writes() -> None:
     hints = get_type_hints(TrainingProvenance) | get_type_hints(SimulatorProvenance)
     for name, choices in (("kind", Kind), ("percentiles", Percentiles), ("delivery", Delivery)):
         assert get_args(hints[name]) == get_args(choices)
+
+
+@pytest.mark.parametrize("wrong", [np.nan, np.inf, -np.inf])
+def test_an_observation_that_is_not_finite_is_no_action(wrong: float) -> None:
+    policy = through_neurons()
+    observation = np.zeros(len(policy.scales))
+    observation[-1] = wrong
+    for act in (policy.act_greedily, policy.probabilities, lambda seen: policy.act(seen, np.random.default_rng(1))):
+        with pytest.raises(InvalidArgument, match="observation: expected finite numbers, got"):
+            act(observation)

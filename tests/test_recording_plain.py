@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import pickle
+import re
 import tempfile
 import zipfile
 from pathlib import Path
@@ -724,3 +725,18 @@ def test_text_labels_and_a_negative_duration_are_named_in_errors(tmp_path: Path)
     assert (read_recording(started).start_s, read_recording(started, start_s=0.0).start_s) == (-1.0, 0.0)
     with pytest.raises(InvalidFile, match=r"the latter 0 or more, got -0\.25 and -1"):
         read_recording(npz(tmp_path, **SPIKES, **STIMULI, duration_s=-1.0))
+
+
+@pytest.mark.parametrize(
+    ("columns", "message"),
+    [
+        ({"duration_s": 1.0}, "spike_time_s: expected times within the recording (0 to 1 s), got 0.1 to 2 s"),
+        ({"channel_label": ["a", "a"], "spike_channel": ["a", "a"]}, "channel_label: expected each label once"),
+        ({"stimulus_frequency_hz": [-1.0]}, "stimulus_frequency_hz: expected positive frequencies"),
+    ],
+)
+def test_a_message_names_the_column_of_the_file(columns: dict[str, Any], message: str, tmp_path: Path) -> None:
+    file = tmp_path / "a.npz"
+    np.savez(file, **{"spike_time_s": [0.1, 2.0], "spike_channel": [0, 0], "stimulus_time_s": [0.05], **columns})
+    with pytest.raises(InvalidFile, match=re.escape(f"a.npz: {message}")):
+        read_recording(file)

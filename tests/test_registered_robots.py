@@ -351,10 +351,12 @@ def test_a_bad_robot_ends_in_a_line_before_anything_is_read_or_recorded(
 
 def test_an_observation_spec_that_raises_ends_in_a_line(package: Path, capsys: Any) -> None:
     at = written(package, ("return (animat.Quantity", "return 1 / 0, (animat.Quantity"))
+    script = package / f"{at.partition(':')[0]}.py"
+    line = next(i for i, line in enumerate(script.read_text().splitlines(), 1) if "1 / 0" in line)
     for command in (["robots", at], ["train", at, "--recordings", "no-such-folder"]):
         assert main(command) == 1
         said = "animat: Rover.observation_spec: expected a tuple of Quantity, got ZeroDivisionError: division by zero"
-        assert capsys.readouterr().err.splitlines() == [said]
+        assert capsys.readouterr().err.splitlines() == [f"{said} ({script.name}, line {line})"]
     with pytest.raises(InvalidArgument, match="observation_spec: expected a tuple of Quantity"):
         run_study(Study(robots=(RobotSpec("rover", kind=at),)), package / "study")
     assert not (package / "study").exists()
@@ -441,5 +443,7 @@ def test_a_script_that_workers_cannot_import_is_told_what_to_do_first(package: P
     script = package / "my_package" / "robots.py"
     script.write_text(f"{script.read_text()}\nraise animat.Mismatch('another run is at work')\n")
     need = "robot: expected what the script runs under `if __name__ == '__main__':`, as worker processes import it; "
-    with pytest.raises(InvalidArgument, match=f"^{re.escape(need)}.*another run is at work$"):
+    with pytest.raises(
+        InvalidArgument, match=f"^{re.escape(need)}.*another run is at work \\(robots.py, line \\d+\\)$"
+    ):
         recreate(*how)

@@ -25,6 +25,10 @@ register_environments()
 
 
 def __getattr__(name: str) -> object:
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("animat")
     if name not in _MODULE_OF:
         raise AttributeError(f"module 'animat' has no attribute {name!r}")
     return getattr(importlib.import_module(_MODULE_OF[name]), name)

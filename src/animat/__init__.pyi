@@ -2,6 +2,8 @@
 
 # ruff: noqa: I001
 
+__version__: str
+
 from animat.recordings.recording import Recording as Recording, Channels as Channels
 from animat.stimulation.stimulus import Stimuli as Stimuli
 from animat.stimulation.protocol import (

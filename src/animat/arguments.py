@@ -106,8 +106,10 @@ def _strangers(value: Any, hint: Any) -> list[Any]:
         return [value] if all(_strangers(value, each) for each in inner) else []
     if kind is Any or not isinstance(kind, type) or kind.__module__ == "jaxtyping":
         return []
-    if issubclass(kind, np.ndarray) or (issubclass(kind, tuple) and Ellipsis not in inner):
+    if issubclass(kind, np.ndarray):
         return []
+    if issubclass(kind, tuple) and Ellipsis not in inner:
+        return [] if isinstance(value, Iterable) else [value]
     if getattr(kind, "_is_protocol", False):
         fits = "__call__" not in vars(kind) or callable(value)
     elif inner and issubclass(kind, Mapping):
@@ -130,6 +132,8 @@ def _words(hint: Any) -> str:
     if kind in (Union, UnionType):
         said = [each for each in inner if _name(each) not in _UNSAID]
         return ", or ".join(map(_words, said if set(said) - {NoneType} else inner))
+    if inner and issubclass(kind, tuple) and Ellipsis not in inner:
+        return f"a tuple of {' and '.join(map(_words, inner))}"
     if inner and issubclass(kind, Iterable):
         by_name = issubclass(kind, Mapping)
         each = inner[1] if by_name else inner[0]

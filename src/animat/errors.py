@@ -6,9 +6,15 @@ import copyreg
 import difflib
 import os
 import re
+import sysconfig
+import traceback
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
+
+_INSTALLED = (str(Path(__file__).parent), *{sysconfig.get_path(name) for name in ("stdlib", "purelib", "platlib")})
+"""Folders of code that no user wrote."""
 
 
 class AnimatError(Exception):
@@ -150,9 +156,22 @@ def did_you_mean(word: str, among: Iterable[str]) -> str:
 
 
 def first_line(error: BaseException) -> str:
-    """An error of third-party code: its type and the first line of its message, which may quote a damaged file."""
+    """An error of third-party code: its type, the first line of its message, which may quote a damaged file, and where.
+
+    The place is the last line that ran in a user's own file, such as a robot's; none for code that is installed.
+    """
     line = "".join(filter(str.isprintable, str(error).strip().partition("\n")[0]))
-    return f"{type(error).__name__}: {line[:300] or 'no more is known'}"
+    return f"{type(error).__name__}: {line[:300] or 'no more is known'}{_place_in_own_file(error)}"
+
+
+def _place_in_own_file(error: BaseException) -> str:
+    if isinstance(error, SyntaxError):
+        # Its message names the place.
+        return ""
+    frames = traceback.walk_tb(error.__traceback__)
+    places = [(Path(frame.f_code.co_filename), line) for frame, line in frames]
+    own = [(file, line) for file, line in places if file.is_absolute() and not str(file).startswith(_INSTALLED)]
+    return f" ({own[-1][0].name}, line {own[-1][1]})" if own else ""
 
 
 def out_of_memory(error: BaseException) -> str | None:

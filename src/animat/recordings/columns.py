@@ -21,6 +21,8 @@ from animat.tables import UNKNOWN, expect_times
 Column = np.ndarray[Any, Any]
 
 REQUIRED = ("spike_time_s", "spike_channel", "stimulus_time_s")
+_COLUMN_OF = {"spike_times_s:": "spike_time_s:", "channels.": "channel_", "stimuli.": "stimulus_"}
+"""How messages begin that name an attribute of a recording, and the column that a user knows instead."""
 LONGEST_TEXT = 1_000
 """Most characters of a name: an array reserves room for the longest name in every row."""
 
@@ -51,6 +53,15 @@ class PlainColumns:
 
     def to_recording(self, provenance: Mapping[str, str], findings: tuple[Finding, ...] = ()) -> Recording:
         """Check and sort the columns and make a recording from them, with the findings so far."""
+        try:
+            return self._to_recording(provenance, findings)
+        except UnusableData as error:
+            message = str(error)
+            for name, column in _COLUMN_OF.items():
+                message = column + message.removeprefix(name) if message.startswith(name) else message
+            raise UnusableData(message) from error
+
+    def _to_recording(self, provenance: Mapping[str, str], findings: tuple[Finding, ...]) -> Recording:
         for name in ("spike_channel", "channel_label", "stimulus_pattern"):
             dtype = np.asarray(getattr(self, name)).dtype
             # Characters for which every row of a text column has room.

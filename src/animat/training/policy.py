@@ -193,7 +193,7 @@ class Policy:
     def outputs(self, observation: Float[np.ndarray, " observations"]) -> Float32[np.ndarray, " outputs"]:
         """The network's outputs for an observation in physical units.
 
-        Raises InvalidArgument for one of the wrong shape; NaN is not checked.
+        Raises InvalidArgument for one of the wrong shape, or with NaN or infinity, which would pass for an action.
         """
         shape = self.scales.shape
         # An array's attribute comes first, as reading it takes only a hundredth of a decision's time.
@@ -201,6 +201,8 @@ class Policy:
             got, name = np.shape(observation), self.robot.name
             raise InvalidArgument(f"observation: expected one of {name}, shape {shape}, got shape {got}")
         hidden = observation / self.scales
+        if not np.isfinite(hidden).all():
+            raise InvalidArgument(f"observation: expected finite numbers, got {np.asarray(observation).tolist()}")
         for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
             hidden = hidden @ weight
             hidden += bias
