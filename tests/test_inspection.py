@@ -448,6 +448,15 @@ def test_figures_are_written_whole_and_the_same_each_time(tmp_path: Path, file_f
     assert len(list((tmp_path / "figures").iterdir())) == 4
 
 
+def test_a_response_far_above_all_others_does_not_squeeze_them_and_is_counted() -> None:
+    responses = extract_responses(answering({5: 10.0, 10: 14.0}), burst_threshold=1.0)
+    assert draw_response_histograms(responses).get_suptitle() == ""
+    rate_hz = np.where(np.arange(len(responses)) == 3, 50 * responses.rate_hz.max(), responses.rate_hz)
+    figure = draw_response_histograms(replace(responses, rate_hz=rate_hz))
+    assert f"1 of {len(responses):,} responses are larger than " in figure.get_suptitle()
+    assert axes_of(figure)[0].get_xlim()[1] < 3 * responses.rate_hz.max()
+
+
 def test_another_ending_is_refused(tmp_path: Path) -> None:
     figure = draw_response_histograms(extract_responses(answering({5: 10.0})))
     with pytest.raises(InvalidArgument, match="expected a figure's name to end in"):

@@ -856,7 +856,7 @@ def test_training_reports_the_memory() -> None:
     decay, weight, neighbour_exponent, _ = fit_memory(series[0]).memory
     assert first.startswith("memory at 0 min: a response depends on earlier trials, ")
     assert (
-        f"each trial counts {decay:.2g} times as much as the one after it, and a stimulus {weight:.2g} times as"
+        f"each trial counts {decay:.2g} times as much as the one after it, and its stimulus {weight:.2g} times as"
         in first
     )
     n = int(np.median([np.count_nonzero(series[0].condition == c) for c in range(2)]))

@@ -290,7 +290,7 @@ def _memories(timeline: SimulatorTimeline) -> Iterator[str]:
             load = f". It also depends on the amount of stimulation in the last {load_s:g} s" if load_s else ""
             text = (
                 f"a response depends on earlier trials, where each trial counts {decay:.2g} times as much as the one "
-                f"after it, and a stimulus {weight:.2g} times as much as its response{load}. The simulator draws from "
-                f"the {near} responses with the most similar history, out of {total:,} per condition"
+                f"after it, and its stimulus {weight:.2g} times as much as its response{load}. The simulator draws "
+                f"from the {near} responses with the most similar history, out of {total:,} per condition"
             )
             yield f"memory at {in_min(start_min)}: {'none was found' if memory == NO_MEMORY else text}"

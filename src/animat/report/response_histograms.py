@@ -28,7 +28,8 @@ _MOST_ROWS, _MOST_COLUMNS, _BINS_OVER_TIME = 20, 8, 24
 def draw_response_histograms(responses: Responses, last: Responses | None = None) -> Figure:
     """Non-burst responses to every condition on a common axis, with P50, the median of all of them.
 
-    At most 16 conditions are drawn, those with the most responses. `last`, with the same conditions, is outlined.
+    At most 16 conditions are drawn, those with the most responses, up to 1.5 times the 99th percentile of all
+    responses; the title states what is left out. `last`, with the same conditions, is outlined.
     """
     n = [len(responses.rates_of(i)) for i in range(len(responses.conditions))]
     drawn = sorted(sorted(range(len(n)), key=lambda i: -n[i])[:_MOST_PANELS])
@@ -46,7 +47,7 @@ def draw_response_histograms(responses: Responses, last: Responses | None = None
     panels = figure.subplots(rows, columns, sharex=True, squeeze=False).T.reshape(-1)
     colours = condition_colours([condition.unit for condition in responses.conditions])
     rates_hz = [each.non_burst_rate_hz for each in (responses, last) if each is not None]
-    edges_hz = rate_edges(responses, np.concatenate(rates_hz), _BINS)
+    edges_hz, beyond = _edges_of_most(responses, np.concatenate(rates_hz), _BINS)
     for axes, i in zip(panels, drawn, strict=False):
         x = responses.rates_of(i)
         weights, alpha = np.full(len(x), 1 / max(len(x), 1)), None if last is None else 0.7
@@ -68,9 +69,11 @@ def draw_response_histograms(responses: Responses, last: Responses | None = None
         # The lowest panel has labels even if its column is not full.
         panels[min((column + 1) * rows, max(len(drawn), 1)) - 1].tick_params(labelbottom=True)
     figure.supxlabel(_RATE, fontsize=9)
-    if left_out := len(n) - len(drawn):
-        title = f"the {len(drawn)} conditions with the most responses; {left_out} more are not drawn"
-        figure.suptitle(title, fontsize=9)
+    left_out = [beyond] if beyond else []
+    if more := len(n) - len(drawn):
+        left_out.insert(0, f"the {len(drawn)} conditions with the most responses; {more} more are not drawn")
+    if left_out:
+        figure.suptitle("\n".join(left_out), fontsize=9)
     return figure
 
 
@@ -84,10 +87,7 @@ def draw_responses_over_time(series: Sequence[Responses]) -> Figure:
     conditions = shown[0].conditions[:_MOST_COLUMNS]
     rates = [[responses.rates_of(i) for responses in shown] for i in range(len(conditions))]
     all_hz = np.concatenate([x for of in rates for x in of])
-    # A few bursts that were not separated must not squeeze all others into one bin.
-    reach_hz = 1.5 * float(np.quantile(all_hz, 0.99)) if len(all_hz) else 0.0
-    edges_hz = rate_edges(shown[0], all_hz[all_hz <= reach_hz], _BINS_OVER_TIME)
-    beyond = int(np.count_nonzero(all_hz > edges_hz[-1]))
+    edges_hz, beyond = _edges_of_most(shown[0], all_hz, _BINS_OVER_TIME)
     columns = len(conditions) if len(conditions) <= 5 else 4
     down = -(-len(conditions) // columns)
     wide_in = 2.2 if columns <= 4 else 1.9
@@ -119,7 +119,7 @@ def draw_responses_over_time(series: Sequence[Responses]) -> Figure:
     if len(conditions) < len(shown[0].conditions):
         left_out.append(f"{len(conditions)} of {len(shown[0].conditions)} conditions")
     if beyond:
-        left_out.append(f"{beyond:,} of {len(all_hz):,} responses are larger than {edges_hz[-1]:.3g} Hz and not drawn")
+        left_out.append(beyond)
     if left_out:
         figure.suptitle(", ".join(left_out), fontsize=10)
     figure.supxlabel(_RATE, fontsize=9)
@@ -153,6 +153,18 @@ def draw_burst_separation(responses: Responses) -> Figure:
         for handle in axes.get_legend().legend_handles:
             handle.set_alpha(1)
     return figure
+
+
+def _edges_of_most(
+    responses: Responses, rates_hz: Float64[np.ndarray, " n"], n_bins: int
+) -> tuple[Float64[np.ndarray, " edges"], str]:
+    """Edges of bins up to 1.5 times the 99th percentile, and in words how many rates are larger; "" if none is."""
+    # A few bursts that were not separated must not squeeze all others into one bin.
+    reach_hz = 1.5 * float(np.quantile(rates_hz, 0.99)) if len(rates_hz) else 0.0
+    edges_hz = rate_edges(responses, rates_hz[rates_hz <= reach_hz], n_bins)
+    beyond = int(np.count_nonzero(rates_hz > edges_hz[-1]))
+    said = f"{beyond:,} of {len(rates_hz):,} responses are larger than {edges_hz[-1]:.3g} Hz and not drawn"
+    return edges_hz, said if beyond else ""
 
 
 def _scatter(axes: Axes, responses: Responses, which: np.ndarray | slice, colour: str, label: str | None) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
@@ -67,7 +68,10 @@ def draw_validation(name: str, validation: Validation) -> Figure:
     calibration.axhspan(low, high, color="#DDDDDD", label="uniform", linewidth=0)
     edges = np.linspace(0, 1, PIT_BINS + 1)
     for s in (v.of(MARGINAL), *shown):
-        calibration.stairs(pit_shares(s.transforms), edges, color=_COLOURS[s.kind], linewidth=1.6, label=s.kind)
+        # Without lines down to 0, which would pass for data.
+        style: Any = {"baseline": None, "color": _COLOURS[s.kind], "linewidth": 1.6}
+        label = "histogram (and empirical)" if s.kind == "histogram" else s.kind
+        calibration.stairs(pit_shares(s.transforms), edges, label=label, **style)
     calibration.set_ylim(bottom=0)
 
     lags = np.arange(1, LAGS + 1)
