@@ -1039,6 +1039,19 @@ class TestCommand:
         assert "budget.pulses: 50 of 50 pulses are spent, and 2 more were wanted" in printed.err
         assert "50 of 50 pulses" in printed.out
 
+    def test_a_budget_that_ends_before_the_robot_moves_is_refused_before_the_culture_is_opened(
+        self, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], never_opened: None
+    ) -> None:
+        policy, out = str(folder / "policies" / "p0.safetensors"), tmp_path / "session"
+        options = ["--recordings", str(folder / "recordings"), "--out", str(out), "--warm-up", "5", "--budget-pulses"]
+        # Five trials of each of five conditions, and one more, of two pulses each.
+        assert main(["run", policy, *options, "51"]) == 1
+        said = "--budget-pulses: 0 of 51 pulses are spent, and 52 more were wanted until the robot first moves"
+        assert said in capsys.readouterr().err
+        assert not out.exists()
+        with pytest.raises(AssertionError):
+            main(["run", policy, *options, "52"])
+
     def test_a_bad_simulator_is_found_before_recordings_are_read(
         self, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], never_opened: None
     ) -> None:

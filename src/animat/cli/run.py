@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from tyro.conf import Positional
 
 from animat.cli.command import StimulationOptions, expect_no_fault, policies_for, simulator_settings
-from animat.errors import InvalidArgument, Mismatch, UnsafeStimulus, expect_at_least, in_min
+from animat.errors import BudgetSpent, InvalidArgument, Mismatch, UnsafeStimulus, expect_at_least, in_min
 from animat.plain_file import expect_no_file
 from animat.progress import Bar, Progress
 from animat.recordings.findings import Finding
@@ -100,9 +100,18 @@ class Run(StimulationOptions):
         calibration = self._calibration(recordings, first, fit)
         calibrating = next(recording for recording in recordings if recording.start_min == calibration.start_min)
         protocol, unknown = self._protocol(recordings, calibrating)
-        loop, _ = Loop.of_policy(
-            first, calibration.percentiles, conditions=calibration.conditions, pulse=protocol.pulse, **settings
-        )
+        adaptive_from = calibration.adjusted if calibration.adaptive else None
+        of_loop: dict[str, Any] = {
+            "conditions": calibration.conditions,
+            "pulse": protocol.pulse,
+            "adaptive_from": adaptive_from,
+        }
+        loop, _ = Loop.of_policy(first, calibration.percentiles, **of_loop, **settings)
+        try:
+            account.check_number(loop.pulses_until_moved)
+        except BudgetSpent as spent:
+            until = "until the robot first moves, with settling and warm-up: give a larger budget"
+            raise BudgetSpent(f"{spent} {until}") from spent
         expect_no_file(self.out, "the session")
         # After all checks, as the lock makes the folder.
         with ExitStack() as stack, exclusive_lock(self.out), Bar("culture") as progress:

@@ -18,7 +18,7 @@ from animat.evaluation.transfer import describe_window, other_presentation
 from animat.goals.robot import body_and_goal
 from animat.neurons.history_tracker import AdjustedRanks, HistoryTracker
 from animat.recordings.findings import Finding
-from animat.responses.condition import Condition
+from animat.responses.condition import RESTING, Condition
 from animat.responses.readouts import ALL, Readouts
 from animat.responses.windows import DEFAULT_WINDOW_MS, check_window
 from animat.robots.base import Robot
@@ -137,6 +137,12 @@ class Loop:
         """Trials of each condition after each of the pauses before an episode."""
         settling = self.settling if episode == 0 else 0
         return [SETTLING_ROUNDS] * (settling or 0) + [0 if is_silent else self.warm_up or 0]
+
+    @property
+    def pulses_until_moved(self) -> int:
+        """Pulses delivered before the robot first moves: settling, warm-up and one trial."""
+        delivered = sum(condition.electrodes != RESTING for condition in self.conditions)
+        return self.pulses * (delivered * sum(self.rounds_before(0, is_silent=False)) + 1)
 
     @property
     def history(self) -> HistoryTracker | None:
