@@ -13,7 +13,7 @@ from jaxtyping import Float64, Int64
 from scipy import signal
 
 from animat.cultures.traces import Traces, record_traces
-from animat.errors import InvalidArgument, InvalidFile
+from animat.errors import InvalidArgument, InvalidFile, UnusableData
 from animat.recordings.conversion import read_traces
 from animat.recordings.detection.artefacts import without_artefacts
 from animat.recordings.detection.settings import Detection
@@ -738,3 +738,20 @@ def test_a_channel_that_occurs_twice_is_read_from_its_first_column_with_its_conv
         del file["acquisition/traces/starting_time"].attrs["rate"]
     with pytest.raises(InvalidFile, match="expected timestamps of /acquisition/traces, or a rate in Hz"):
         open_traces(tmp_path / "a.nwb")
+
+
+def test_more_than_half_of_the_channels_may_be_dead() -> None:
+    voltage, _ = noisy(10, 3.0)
+    voltage[:, 3:9] = np.random.default_rng(2).normal(0, 3, voltage[:, 3:9].shape)
+    found = detect_spikes(RawTraces.from_array(voltage, channels(10), RATE_HZ, uv_per_step=0.1), np.empty(0))
+    said = {finding.name: finding for finding in found.findings}
+    assert said["dead-channels"].value == 6 and "noisy-channels" not in said
+    assert said["noise"].value == pytest.approx(np.median(found.noise_uv[[0, 1, 2, 9]]))
+    assert said["noise"].value > 5 * found.noise_uv[3:9].max() and "median of 4 channels" in said["noise"].message
+    assert set(found.channel.tolist()) == {0, 1, 2, 9}
+
+
+def test_traces_without_samples_are_refused() -> None:
+    none = RawTraces.from_array(np.zeros((0, 2), np.int16), channels(2), RATE_HZ, uv_per_step=0.1)
+    with pytest.raises(UnusableData, match="traces: expected samples, got none"):
+        detect_spikes(none, np.empty(0))

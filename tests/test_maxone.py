@@ -14,6 +14,7 @@ import pytest
 
 from animat.cultures.base import Culture
 from animat.cultures.contract import CultureContract
+from animat.cultures.devices import maxone_stream
 from animat.cultures.devices.maxone import MAXONE_LIMITS, MaxOneCulture
 from animat.cultures.devices.maxone_commands import dac_code
 from animat.cultures.devices.maxone_stream import EVENT_16, EVENT_24, ZmqSpikes
@@ -225,6 +226,7 @@ def test_spikes_are_by_channel_and_those_of_no_electrode_are_counted(rig: Rig) -
         assert culture.channels.label[spikes.channel].tolist() == ["31", "32"]
         assert culture.spikes_not_recorded == 1
         without = {"spikes on amplifiers without an electrode": 1, "frames lost on the way": 0}
+        without["spikes dropped, as too many came in one delivery"] = 0
         assert culture.left_out == without | {"spikes reported late": 0}
         stream.late_spikes = 2  # type: ignore[attr-defined]
         assert culture.left_out == without | {"spikes reported late": 2}
@@ -489,3 +491,14 @@ def test_the_stream_hears_a_server() -> None:
             stream.stop()
             going.clear()
             thread.join()
+
+
+def test_spikes_for_which_there_is_no_room_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(maxone_stream, "KEPT_SPIKES", 5)
+    stream = ZmqSpikes()
+    spikes = np.zeros(2, EVENT_16)
+    for message in (10, 20, 30, 40):
+        spikes["frame"] = message
+        stream.hear([np.uint64(message).tobytes(), b"", spikes.tobytes()])
+    assert stream.take(0, 100)[0].tolist() == [20, 30, 30, 40, 40]
+    assert stream.dropped_spikes == 3

@@ -126,3 +126,7 @@ def test_the_outlook_is_one_line() -> None:
     assert str(Outlook(6.0, None, 0.4, 1.5)).endswith(
         "lasts for about 0 min, but the settling before the first episode takes 1.5 min (--settling)"
     )
+
+
+def test_recordings_that_all_start_at_one_minute_have_no_drift_from_one_to_the_next() -> None:
+    assert median_drift([responses(5.0, np.full(40, 9.0)), responses(5.0, np.full(40, 6.0))]) is None

@@ -58,3 +58,25 @@ def test_recordings_of_rigs_are_placed_by_their_dates(tmp_path: Path, capsys: py
     assert [finding["name"] for finding in inspected["together"]] == ["placed-by-date"]
     assert [each["start_min"] for each in inspected["recordings"]] == [0.0, 72.5]
     assert [Path(figure).name for figure in inspected["figures"]][-1] == "series-drift.png"
+
+
+def test_a_devices_clock_that_was_restarted_is_known_by_the_dates() -> None:
+    recording = synthetic_recording(1, patterns=20, channels=32)
+
+    def of(kind: str, *starts: tuple[float, float]) -> list[float]:
+        day = datetime(2024, 5, 1, tzinfo=UTC)
+        series = [
+            replace(recording, start_min=at, culture=RecordedCulture(kind), recorded_at=day + timedelta(minutes=date))
+            for at, date in starts
+        ]
+        return [each.start_min for each in placed_by_date(series)]
+
+    # Two days, on each of which the clock began anew, as a program did.
+    days = (0.0002, 0.0), (10.0004, 10.0), (0.0003, 1440.0), (10.0005, 1450.0)
+    assert of("maxone", *days) == [0.0, 10.0, 1440.0, 1450.0]
+    assert of("maxone", (600.0, 0.0), (5.0, 1440.0)) == [0.0, 1440.0]
+    # One clock, read with a little delay; and a simulator's, on which more time passes than here.
+    for kind, starts in (("maxone", ((0.0, 0.0), (10.1, 10.6))), ("cl1", ((0.0, 0.0), (10.0, 1.0)))):
+        assert of(kind, *starts) == [at for at, _ in starts]
+    # Minutes of a file of a rig were stated.
+    assert of("recording", (1.0, 0.0), (2.0, 1440.0)) == [1.0, 2.0]

@@ -19,6 +19,7 @@ from animat.responses.extraction import extract_responses, extract_series
 from animat.responses.inspection import inspect_recording
 from animat.responses.quality import drift
 from animat.responses.quality.drift import drift_findings
+from animat.responses.quality.responses import _difference
 from animat.responses.responses import Responses
 from animat.stimulation.protocol import Order, Presentation
 from synthetic_recordings import SyntheticCulture
@@ -318,3 +319,14 @@ def test_a_single_unit_that_is_refractory_has_no_coarse_times() -> None:
     times_s = np.cumsum(0.004 + rng.exponential(0.2, 2000))
     source = recording([(t, 0) for t in times_s], np.arange(1.0, 300.0), 4, 500.0)
     assert "coarse-times" not in findings(source)
+
+
+def test_a_median_that_is_the_smallest_response_is_named_as_such() -> None:
+    rng = np.random.default_rng(0)
+    condition = np.repeat(np.arange(2), 200)
+    rate_hz = np.where(rng.random(400) < np.where(condition == 0, 0.2, 0.45), 30.0, 0.0)
+    never, conditions = np.zeros(400, np.bool_), (Condition("5 Hz", 5.0, "Hz"), Condition("80 Hz", 80.0, "Hz"))
+    responses = Responses(condition, rate_hz, np.zeros(400), never, conditions, (2.0, 10.0), 4, 1.0, 0.0)
+    (found,) = _difference(responses)
+    assert (found.name, found.severity) == ("no-difference", "warning")
+    assert "more than half of the responses are the smallest, 0 Hz, so all conditions pass P50" in found.message

@@ -5,11 +5,14 @@ from __future__ import annotations
 import gc
 import itertools
 import math
+import subprocess
+import sys
 import weakref
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from fractions import Fraction
+from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
 
@@ -419,3 +422,24 @@ def test_a_dropped_guard_is_freed_without_garbage_collection() -> None:
         assert freed() is None
     finally:
         gc.enable()
+
+
+def test_a_culture_that_a_program_leaves_open_is_closed_at_its_end() -> None:
+    program = """
+from fake_culture import FakeCulture
+
+class Device(FakeCulture):
+    def _close(self):
+        print("power off", flush=True)
+
+left, closed, again = Device().open(), Device().open(), Device().open()
+closed.close()
+again.close()
+again.open()
+print("end", flush=True)
+raise SystemExit("an error")
+"""
+    tests = str(Path(__file__).parent)
+    ran = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, cwd=tests, check=False)
+    assert ran.stdout.split("\n") == ["power off", "power off", "end", "power off", "power off", ""], ran.stderr
+    assert ran.returncode == 1 and "Traceback" not in ran.stderr

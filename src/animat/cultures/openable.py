@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import abc
+import atexit
 import os
+import sys
 import threading
+import weakref
 from collections.abc import Callable
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, NoReturn, Self, final
 
@@ -20,6 +24,15 @@ from animat.stimulation.plain import seconds
 
 _LOOK_S = 0.02
 """How often a waiting call checks for an emergency stop."""
+
+
+def _close_at_exit(opened: Callable[[], Openable | None]) -> None:
+    culture = opened()
+    try:
+        if culture is not None:
+            culture.close()
+    except Exception as error:
+        print(f"warning: {error}", file=sys.stderr)
 
 
 class Turns:
@@ -81,6 +94,7 @@ class Openable(abc.ABC):
         self.__process = os.getpid()
         self.__hold = ExitStack()
         self.__token = os.urandom(8).hex()
+        self.__at_exit = partial(_close_at_exit, weakref.ref(self))
 
     def __reduce_ex__(self, protocol: object) -> NoReturn:
         raise InvalidArgument("culture: expected no copies, got a request to copy or pickle it: create another one")
@@ -156,6 +170,9 @@ class Openable(abc.ABC):
                         self._rest(max(1.0, limits.interval_us * 1e-6, limits.gap_us * 1e-6))
                     now_s = seconds("now_s", self.now_s)
                     self.__turns = Turns(Guard(limits, self.stimulation_electrodes, self.__history, now_s))
+                    if self.ends_within_s >= 0:
+                        # A program may end without closing it, which would leave a device's stimulation on.
+                        atexit.register(self.__at_exit)
             except BaseException as error:
                 self.__turns = None
                 try:
@@ -183,6 +200,7 @@ class Openable(abc.ABC):
         lock: AbstractContextManager[object] = self.__open_close_lock if is_ours else nullcontext()
         with lock:
             turns, self.__turns = self.__turns, None
+            atexit.unregister(self.__at_exit)
             if turns is None:
                 return
             with as_device_failure(self.name, "close"), self.__hold.pop_all():

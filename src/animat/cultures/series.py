@@ -6,6 +6,7 @@ import json
 import os
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,6 +21,7 @@ from animat.errors import InvalidArgument, Mismatch, expect_at_least, shown
 from animat.folders import first_difference
 from animat.progress import Part, Progress, Silent
 from animat.recordings.formats.nwb import recording_name, write_nwb
+from animat.recordings.placing import RESTARTED_MIN
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
 from animat.stimulation.protocol import Protocol
@@ -230,7 +232,13 @@ def _start_s(made: Mapping[int, Path], culture: Culture, protocol: Protocol, int
             raise _another(file, f"with this culture's patterns, got others ({strange.value:g} of them)")
         if zero_s is None:
             zero_s = 60 * recording.start_min - session * interval_s
-        if culture.now_s < 60 * recording.start_min + recording.duration_s:
+        since_s = culture.now_s - 60 * recording.start_min
+        if culture.device is not None and recording.recorded_at is not None:
+            passed_s = (datetime.now(UTC) - recording.recorded_at).total_seconds()
+            if passed_s > since_s + 60 * RESTARTED_MIN:
+                passed = f"{since_s / 60:.0f} min ago by the culture's clock, got one of {passed_s / 60:.0f} min ago"
+                raise _another(file, f"{passed} by its date: the clock was restarted")
+        if since_s < recording.duration_s:
             at = f"{culture.now_s / 60:.2f} min, got one at {recording.start_min:.2f} min"
             raise _another(file, f"before the culture's clock, which is at {at}: it was restarted, or is another's")
     return culture.now_s if zero_s is None else zero_s

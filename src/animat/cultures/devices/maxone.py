@@ -164,9 +164,11 @@ class MaxOneCulture(Culture):
 
     @property
     def left_out(self) -> dict[str, int]:
-        lost, late = (int(getattr(self._stream, name, 0)) for name in ("lost_frames", "late_spikes"))
+        names = ("lost_frames", "late_spikes", "dropped_spikes")
+        lost, late, dropped = (int(getattr(self._stream, name, 0)) for name in names)
         counts = {"spikes on amplifiers without an electrode": self.spikes_not_recorded}
-        return counts | {"frames lost on the way": lost, "spikes reported late": late}
+        counts |= {"frames lost on the way": lost, "spikes reported late": late}
+        return counts | {"spikes dropped, as too many came in one delivery": dropped}
 
     def _open(self) -> None:
         self._mx = mx = vendor_module("maxlab", _NO_MODULE)

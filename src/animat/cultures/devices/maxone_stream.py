@@ -50,7 +50,8 @@ class ZmqSpikes:
     """The stream of MaxLab Live's server through ZeroMQ (the package pyzmq), read by a thread.
 
     A message has up to three parts: the frame's number, the samples of all channels, and the spikes of that frame.
-    Frames lost in transmission are counted in `lost_frames`, spikes that came after theirs were taken in `late_spikes`.
+    Frames lost in transmission are counted in `lost_frames`, spikes that came after theirs were taken in `late_spikes`,
+    and spikes for which there was no room, the oldest, in `dropped_spikes`.
     """
 
     def __init__(self, address: str = ADDRESS) -> None:
@@ -62,13 +63,13 @@ class ZmqSpikes:
         self._thread: threading.Thread | None = None
         self._going = threading.Event()
         self._failed: Exception | None = None
-        self.lost_frames = self.late_spikes = self._taken = 0
+        self.lost_frames = self.late_spikes = self.dropped_spikes = self._taken = 0
 
     def start(self) -> None:
         missing = "culture: expected the package pyzmq to read a maxone, which is not installed"
         zmq = vendor_module("zmq", f"{missing}: {pip_install('pyzmq')}")
         self._frame, self._failed = -1, None
-        self.lost_frames = self.late_spikes = self._taken = 0
+        self.lost_frames = self.late_spikes = self.dropped_spikes = self._taken = 0
         self._spikes.clear()
         self._going.set()
         self._came_s = time.monotonic()
@@ -134,7 +135,9 @@ class ZmqSpikes:
             why = "MaxLab Live's server was restarted; close and open again"
             raise DeviceFailed(f"MaxOne: expected frames after {self._frame}, got {number}: {why}")
         if len(parts) > 2 and parts[2]:
-            self._spikes.extend(self._read(parts[2], number))
+            spikes = self._read(parts[2], number)
+            self.dropped_spikes += max(0, len(self._spikes) + len(spikes) - KEPT_SPIKES)
+            self._spikes.extend(spikes)
         if self._frame >= 0 and number > self._frame + 1:
             self.lost_frames += number - self._frame - 1
         self._frame, self._came_s = number, time.monotonic()

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64
 from scipy import fft, signal
 
-from animat.errors import InvalidArgument
+from animat.errors import InvalidArgument, UnusableData
 from animat.process import own_cores
 from animat.progress import Progress, Silent
 from animat.recordings.detection.artefacts import Counts, Flags, Levels, Pulses, Traces
@@ -73,8 +73,11 @@ def detect_spikes(
     Raises:
         InvalidArgument: for a band that does not lie below half the sampling rate.
         InvalidFile: if samples cannot be read.
+        UnusableData: for traces without samples.
     """
     settings, progress, rate_hz = settings or Detection(), progress or Silent(), traces.sampling_rate_hz
+    if not traces.samples:
+        raise UnusableData("traces: expected samples, got none")
     if settings.band_hz is not None and settings.band_hz[1] >= rate_hz / 2:
         expected = f"less than half the sampling rate of {rate_hz:g} Hz"
         got = f"{settings.band_hz[1]:g} Hz: choose a lower upper end, such as {0.4 * rate_hz:g}"
@@ -110,8 +113,11 @@ def detect_spikes(
 
 
 def is_dead(noise_uv: Levels) -> np.ndarray:
-    """Whether a channel has hardly any noise, so that no signal reaches it; shape (channels,)."""
-    return np.asarray(noise_uv <= DEAD * np.median(noise_uv)) if len(noise_uv) else np.zeros(0, dtype=bool)
+    """Whether a channel has hardly any noise, so that no signal reaches it; shape (channels,).
+
+    The usual noise is the upper quartile, as more than half of the channels may be dead.
+    """
+    return np.asarray(noise_uv <= DEAD * np.quantile(noise_uv, 0.75)) if len(noise_uv) else np.zeros(0, dtype=bool)
 
 
 def blocks(channels: int) -> Iterator[slice]:
@@ -263,12 +269,13 @@ def _lost(lost: Counts, samples: int) -> Iterator[Finding]:
 
 
 def _findings(noise_uv: Levels, n_stimuli: int, saturation: np.ndarray, settings: Detection) -> Iterator[Finding]:
-    n, middle = len(noise_uv), float(np.median(noise_uv)) if len(noise_uv) else 0.0
-    yield Finding("noise", "note", f"noise: {middle:.2f} uV on the median of {n:,} channels; spikes are negative "
-                  f"peaks of {settings.threshold:g} times their channel's noise and more", middle)  # fmt: skip
-    if dead := int(np.count_nonzero(is_dead(noise_uv))):
+    n, living_uv = len(noise_uv), noise_uv[~is_dead(noise_uv)]
+    middle = float(np.median(living_uv)) if len(living_uv) else 0.0
+    yield Finding("noise", "note", f"noise: {middle:.2f} uV on the median of {len(living_uv):,} channels; spikes are "
+                  f"negative peaks of {settings.threshold:g} times their channel's noise and more", middle)  # fmt: skip
+    if dead := n - len(living_uv):
         what = "no spike can be detected there, and they count in rates per channel; leave them out of the routing"
-        message = f"dead channels (less than {DEAD:g} of the median noise): {dead:,} of {n:,}; {what}"
+        message = f"dead channels (less than {DEAD:g} of the usual noise): {dead:,} of {n:,}; {what}"
         yield Finding("dead-channels", "note" if dead < 0.1 * n else "warning", message, float(dead))
     if middle > 0 and (noisy := int(np.count_nonzero(noise_uv > NOISY * middle))):
         what = "only large spikes are detected there; look for loose contacts or air bubbles"

@@ -95,10 +95,10 @@ def median_drift(series: Sequence[Responses]) -> MedianDrift | None:
 
     With t_i the starts less their mean, the slope is sum(t_i ln(P50_i)) / sum(t_i^2), and its error is
     sqrt(sum(t_i^2 e_i^2)) / sum(t_i^2), e_i the standard deviation of ln(P50_i) over bootstrap samples of that
-    recording's responses. None for fewer than two recordings, or if a median is 0.
+    recording's responses. None if all start at the same minute, or if a median is 0.
     """
     newest = series[-NEWEST:]
-    if len(newest) < 2 or not all(each.median_rate_hz > 0 for each in newest):
+    if len({each.start_min for each in newest}) < 2 or not all(each.median_rate_hz > 0 for each in newest):
         return None
     rng = np.random.default_rng(0)
     t = np.array([each.start_min for each in newest])

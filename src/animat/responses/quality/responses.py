@@ -289,7 +289,15 @@ def _difference(responses: Responses) -> Iterator[Finding]:
         f"mean command from {2 * lowest - 1:+z.2f} to {2 * highest - 1:+z.2f} on a scale from -1 to +1, and the rest "
         "is chance"
     )
-    if spread < SMALL_DIFFERENCE:
+    if lowest == 1.0:
+        # P50 is tied with the smallest response.
+        message = (
+            f"more than half of the responses are the smallest, {responses.median_rate_hz:g} Hz, so all conditions "
+            "pass P50 and one threshold always commands +1, without stimuli too: choose a longer window (--window-ms), "
+            "or record more channels"
+        )
+        yield Finding("no-difference", "warning", message, spread)
+    elif spread < SMALL_DIFFERENCE:
         message += ", so no policy can steer a robot much better than at random: stimulate in ways that differ more"
         yield Finding("no-difference", "warning", message, spread)
     elif spread < LITTLE_DIFFERENCE:
