@@ -293,8 +293,8 @@ def test_the_verdict_says_which_controls_are_not_outperformed_and_what_a_gap_may
         return replace(gap, rows=rows).verdict()
 
     high = float(policies.predicted.max()) + 1
-    assert verdict(0.001, 0.9, high).startswith("the policies outperform every control (p < 0.01; ")
-    assert verdict(0.02, 0.6, high).startswith("the policies do not outperform these controls: random (p = 0.02; ")
+    assert verdict(0.001, 0.9, high).startswith("these policies outperform every control (p < 0.01; ")
+    assert verdict(0.02, 0.6, high).startswith("these policies do not outperform random (p = 0.02; ")
     at = float(policies.predicted.mean())
     assert verdict(0.001, 0.9, at).endswith("larger in at least 90 % of the pairs of episodes, ties counting half)")
     looked = "a different presentation, few responses, late pulses, bursts, a trend over the session, memory, "

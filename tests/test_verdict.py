@@ -33,7 +33,7 @@ def test_it_says_which_controls_are_not_outperformed() -> None:
     verdict = Verdict.of(policies, {"worse": policies - 9, "like": policies - 0.05, "better": policies + 9})
     assert verdict.not_outperformed == ("like", "better")
     said = str(verdict)
-    assert said.startswith("the policies do not outperform these controls: like (p = ")
+    assert said.startswith("these policies do not outperform like (p = ")
     # Significantly worse than a control is not better than it.
     assert "better (p = " in said and "they are worse: their return is larger in 0 % of the pairs" in said
     assert said.count("worse") == 1
@@ -42,7 +42,7 @@ def test_it_says_which_controls_are_not_outperformed() -> None:
     assert "their return is larger in 50 % of the pairs of episodes, ties counting half)" in equal
     ruled = np.arange(100.0)
     every = str(Verdict.of(ruled, {"worse": ruled - 100, "near": ruled - 60}))
-    assert every.startswith("the policies outperform every control (p < 0.01; ")
+    assert every.startswith("these policies outperform every control (p < 0.01; ")
     # Of 10,000 pairs 780 are lost to the nearer one, and 40 are tied.
     assert every.endswith("larger in at least 92 % of the pairs of episodes, ties counting half)")
     # All but 3 of 10,000 are not "at least 100 %".
@@ -57,9 +57,9 @@ def test_too_few_episodes_are_not_taken_for_no_difference() -> None:
     two = Verdict.of([9.0] * 10, {"a": [0.0] * 2})
     assert two.controls["a"].p < 0.01 and two.not_outperformed == ("a",)
     assert "10 episodes of the policies and 2 of a control are too few to show" in str(two)
-    assert str(six).startswith("the policies outperform every control (p < 0.01; ")
+    assert str(six).startswith("these policies outperform every control (p < 0.01; ")
     # The result for one control is reported even if another was broken off.
     both = Verdict.of(np.arange(20.0), {"broken off": [0.0], "better": np.arange(20) + 90.0})
-    assert str(both).startswith("the policies do not outperform these controls: better (p = ")
-    assert str(both).endswith("too few to show (p < 0.01) whether the policies outperform broken off")
+    assert str(both).startswith("these policies do not outperform better (p = ")
+    assert str(both).endswith("too few to show (p < 0.01) whether these policies outperform broken off")
     assert not EpisodeComparison(0.03, 1.0, 4, 4).has_enough_episodes

@@ -145,8 +145,9 @@ class Session:
     def recording(self) -> Recording:
         """The session as a recording: everything that was observed, and every pulse as a stimulus of its presentation.
 
-        The responses that are extracted from it are, bit for bit, those that the loop acted on. All spikes are read
-        into memory; for a long session read `recording_file` instead. Raises InvalidFile for an inconsistent log.
+        The responses that are extracted from it are, bit for bit, those that the loop acted on, unless a device
+        reported a pulse late: the loop then read a window that ended up to 1 ms early. All spikes are read into memory;
+        for a long session read `recording_file` instead. Raises InvalidFile for an inconsistent log.
         """
         with expect_session_log(self.folder / LOG_FILE):
             blocks = [(np.empty(0), np.empty(0, np.int64)), *self.log.spike_blocks()]

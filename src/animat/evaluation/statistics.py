@@ -307,16 +307,16 @@ class Verdict:
         ]
         parts = []
         if not_outperformed:
-            parts.append(f"the policies do not outperform these controls: {', '.join(not_outperformed)}")
+            parts.append(f"these policies do not outperform {', '.join(not_outperformed)}")
         if few:
             fewest = min(few.values(), key=lambda each: each.control)
             episodes = f"{counted(fewest.policies, 'episode')} of the policies and {fewest.control} of a control"
-            whether = f"(p < {OUTPERFORMED_P:g}) whether the policies outperform {', '.join(few)}"
+            whether = f"(p < {OUTPERFORMED_P:g}) whether these policies outperform {', '.join(few)}"
             parts.append(f"{episodes} are too few to show {whether}")
         if not parts:
             least = min(each.wins for each in self.controls.values())
             parts.append(
-                f"the policies outperform every control (p < {OUTPERFORMED_P:g}; their return is larger in at least "
+                f"these policies outperform every control (p < {OUTPERFORMED_P:g}; their return is larger in at least "
                 f"{math.floor(100 * least + 1e-9)} % of the pairs of episodes, ties counting half)"
             )
         return "; ".join(parts)
