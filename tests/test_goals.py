@@ -20,6 +20,7 @@ from animat.evaluation.optimum import _Programme, _Tables, best_return
 from animat.evaluation.rollouts import Constant, roll_out
 from animat.goals.goal import Ball, Goal, Objective, Range, read_goal
 from animat.goals.robot import RobotWithGoal, body_and_goal, robot_of, with_goal, without_goal
+from animat.goals.tally import Outcome, cells_of, satisfaction_line
 from animat.progress import Silent
 from animat.robots import Cartpole, GymnasiumRobot, Navigation, Quantity, Robot, Shuttle, SwingUp, robot_named
 from animat.robots.base import lacking
@@ -167,6 +168,20 @@ def test_shaping_adds_up_to_the_start_whatever_is_done_and_outcome_and_margin_ag
     assert all(0 <= percent <= 100.001 for percent in outcome.satisfaction)
     low, high = robot.return_range
     assert low - 1e-3 <= rewards <= high + 1e-3
+
+
+def test_the_range_of_returns_goes_from_failing_at_the_end_to_reaching_at_once() -> None:
+    both = with_goal(Slider(6, 0.2), "reach x in 0.5..0.6 m weight 3; avoid x in -0.6..-0.5 m")
+    # Each of six iterations costs 1, and failing 100 and another 6, with weights of 1.5 and 0.5; reaching gives 50.
+    assert both.return_range == pytest.approx((-(6 + 100 * 0.5 + 6), 50 * 1.5))
+    assert with_goal(Slider(6, 0.2), "reach x in 0.5..0.6 m").return_range == (-6, 50)
+
+
+def test_what_episodes_came_to_in_a_table() -> None:
+    outcome = Outcome(jnp.array([True, False]), jnp.array([[100.0, 40.0], [50.0, 0.0]]), jnp.array([0.5, -0.2]))
+    assert cells_of(outcome.means()) == ["50 %", "48 %", "+0.15"]
+    assert cells_of({}) == ["", "", ""]
+    assert satisfaction_line(["reach a", "avoid b"], outcome.means()) == "satisfied: reach a: 75 %; avoid b: 20 %"
 
 
 class Walk(NamedTuple):
