@@ -102,5 +102,8 @@ def test_a_robot_without_a_drawing_is_refused() -> None:
 
     with pytest.raises(InvalidArgument, match="unicycle has no method `draw`"):
         draw_robot(Unicycle(), np.zeros(3))  # type: ignore[arg-type]
-    with pytest.raises(InvalidArgument, match=r"^unicycle\.draw: expected a picture, got ValueError: no wheel$"):
+    with pytest.raises(
+        InvalidArgument,
+        match=r"^unicycle\.draw: expected a picture, got ValueError: no wheel \(test_frames.py, line \d+\)$",
+    ):
         draw_robot(Crashing(), np.zeros(3))  # type: ignore[arg-type]

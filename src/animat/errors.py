@@ -155,13 +155,15 @@ def did_you_mean(word: str, among: Iterable[str]) -> str:
     return f"; did you mean {near[0]}?" if near else ""
 
 
-def first_line(error: BaseException) -> str:
+def first_line(error: BaseException, *, with_place: bool = True) -> str:
     """An error of third-party code: its type, the first line of its message, which may quote a damaged file, and where.
 
     The place is the last line that ran in a user's own file, such as a robot's; none for code that is installed.
     """
     line = "".join(filter(str.isprintable, str(error).strip().partition("\n")[0]))
-    return f"{type(error).__name__}: {line[:300] or 'no more is known'}{_place_in_own_file(error)}"
+    return (
+        f"{type(error).__name__}: {line[:300] or 'no more is known'}{_place_in_own_file(error) if with_place else ''}"
+    )
 
 
 def _place_in_own_file(error: BaseException) -> str:

@@ -129,7 +129,9 @@ def carry_out_together(
     except Exception as error:
         place, memory = traceback.extract_tb(error.__traceback__)[-1], out_of_memory(error)
         where = f"(in {place.name}, {Path(place.filename).name}, line {place.lineno})"
-        reason = f"{first_line(error)} {where}" if memory is None else f"{memory}: {memory_of(tasks[0])}"
+        reason = (
+            f"{first_line(error, with_place=False)} {where}" if memory is None else f"{memory}: {memory_of(tasks[0])}"
+        )
         raise AnimatError(reason) from error
     digests = [{file.relative_to(folder).as_posix(): digest_of(file) for file in sorted(files)} for files in written]
     cpu_s = (time.process_time() - began_s) / len(tasks)
