@@ -13,8 +13,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-_INSTALLED = (str(Path(__file__).parent), *{sysconfig.get_path(name) for name in ("stdlib", "purelib", "platlib")})
-"""Folders of code that no user wrote."""
+_OURS_AND_PYTHONS = str(Path(__file__).parent), sysconfig.get_path("stdlib")
+"""The folders of animat and of Python's own modules."""
 
 
 class AnimatError(Exception):
@@ -172,8 +172,13 @@ def _place_in_own_file(error: BaseException) -> str:
         return ""
     frames = traceback.walk_tb(error.__traceback__)
     places = [(Path(frame.f_code.co_filename), line) for frame, line in frames]
-    own = [(file, line) for file, line in places if file.is_absolute() and not str(file).startswith(_INSTALLED)]
-    return f" ({own[-1][0].name}, line {own[-1][1]})" if own else ""
+    own = [f" ({file.name}, line {line})" for file, line in places if file.is_absolute() and not _is_installed(file)]
+    return own[-1] if own else ""
+
+
+def _is_installed(file: Path) -> bool:
+    """Whether no user wrote this code."""
+    return str(file).startswith(_OURS_AND_PYTHONS) or not {"site-packages", "dist-packages"}.isdisjoint(file.parts)
 
 
 def out_of_memory(error: BaseException) -> str | None:

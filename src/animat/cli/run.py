@@ -100,13 +100,14 @@ class Run(StimulationOptions):
         calibration = self._calibration(recordings, first, fit)
         calibrating = next(recording for recording in recordings if recording.start_min == calibration.start_min)
         protocol, unknown = self._protocol(recordings, calibrating)
-        adaptive_from = calibration.adjusted if calibration.adaptive else None
-        of_loop: dict[str, Any] = {
-            "conditions": calibration.conditions,
-            "pulse": protocol.pulse,
-            "adaptive_from": adaptive_from,
-        }
-        loop, _ = Loop.of_policy(first, calibration.percentiles, **of_loop, **settings)
+        loop, _ = Loop.of_policy(
+            first,
+            calibration.percentiles,
+            conditions=calibration.conditions,
+            pulse=protocol.pulse,
+            adaptive_from=calibration.adjusted if calibration.adaptive else None,
+            **settings,
+        )
         try:
             account.check_number(loop.pulses_until_moved)
         except BudgetSpent as spent:
