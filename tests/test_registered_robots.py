@@ -442,8 +442,9 @@ def test_a_script_that_workers_cannot_import_is_told_what_to_do_first(package: P
     forget()
     script = package / "my_package" / "robots.py"
     script.write_text(f"{script.read_text()}\nraise animat.Mismatch('another run is at work')\n")
+    line = len(script.read_text().splitlines())
     need = "robot: expected what the script runs under `if __name__ == '__main__':`, as worker processes import it; "
     with pytest.raises(
-        InvalidArgument, match=f"^{re.escape(need)}.*another run is at work \\(robots.py, line \\d+\\)$"
+        InvalidArgument, match=f"^{re.escape(need)}.*another run is at work \\(robots\\.py, line {line}\\)$"
     ):
         recreate(*how)
