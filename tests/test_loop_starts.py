@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from scipy.stats import kstest
 
@@ -28,9 +29,10 @@ COURSE = Navigation()
 
 @dataclass(frozen=True)
 class Anywhere(Robot[NavigationState]):
-    """A user's own robot, in no registry: navigation that starts anywhere in the arena, looking anywhere."""
+    """A user's own robot, in no registry: navigation that starts anywhere, or `at` x, y and heading."""
 
     episode_limit: int = 4
+    at: tuple[float, float, float] | None = None
     name: ClassVar[str] = "anywhere"
     noise_size: ClassVar[int] = 0
     paper_iterations: ClassVar[int] = 1000
@@ -40,6 +42,8 @@ class Anywhere(Robot[NavigationState]):
         return COURSE.observation_spec
 
     def reset(self, key: Array) -> NavigationState:
+        if self.at is not None:
+            return NavigationState(*(jnp.float32(each) for each in self.at))
         x, y, heading = jax.random.uniform(key, (3,))
         return NavigationState(x, y, (2 * heading - 1) * np.pi)
 

@@ -55,12 +55,14 @@ from animat.responses.extraction import extract_responses
 from animat.responses.quality.drift import LARGE
 from animat.responses.responses import Responses
 from animat.robots import Cartpole, Navigation, Robot, Shuttle
+from animat.robots.starts import Starts
 from animat.stimulation.array import MAXONE
 from animat.stimulation.protocol import Presentation, Protocol
 from animat.stimulation.selection import Selection
 from animat.training.policy import Policy
 from animat.wrappers import ShuffledDelivery
 from fake_culture import FakeCulture
+from test_loop_starts import Anywhere
 
 PROTOCOL = Protocol(order="mixed", pulses=2, patterns=8, trials=40, setup_s=0.1)
 
@@ -704,6 +706,80 @@ def test_rows_know_which_episodes_have_the_same_start(
     assert turns == ([None] * 3 if isinstance(robot, Cartpole) else [[0, 0, 1, 1, 2, 2], [0, 1, 2], [0, 1, 2]])
     drawn = [episode for episode in gap.session.episodes if episode.agent in policies]
     assert all(one.start == other.start for one, other in zip(drawn[::2], drawn[1::2], strict=True))
+
+
+@pytest.mark.usefixtures("few_bootstraps")
+def test_returns_are_predicted_from_the_starts_of_the_session(tmp_path: Path, series: list[Responses]) -> None:
+    """Of navigation with drawn starts, as far as a robot that always starts where an episode did returns."""
+    policies = {f"p{i}": policy_of(i, series, robot=Anywhere()) for i in range(2)}
+    calibration = Calibration.of_series(series)
+    with FakeCulture() as culture:
+        gap = run_policies(policies, culture, calibration, tmp_path / "s", episodes=3, with_controls=False)
+    together, *rows = gap.rows
+    starts = Starts.of_session(1, 3)
+    for row in rows:
+        own = networks_of([policies[row.name]], greedy=True) if row.name in policies else Uniform()
+        expected = []
+        for turn in range(3):
+            key = starts.of_episodes(3)[turn]
+            fixed = Animat(Anywhere(at=tuple(map(float, Anywhere().reset(key)))), Thresholds(1), 5)
+            expected.append(roll_out(fixed, calibration.simulator, own, episodes=4000, seed=7).returns.mean())
+        assert row.turn is not None and row.turn.tolist() == [0, 1, 2] and row.expected is not None
+        error = row.predicted.std() / np.sqrt(len(row.predicted) / 3)
+        np.testing.assert_allclose(row.expected, expected, atol=5 * error)
+        assert np.ptp(expected) > 20 * error
+        assert row.predicted.mean() == pytest.approx(row.expected.mean())
+        assert row.gap.value == pytest.approx(row.measured.mean() - row.expected.mean())
+    assert together.turn is not None and together.expected is not None
+    for row in rows[:2]:
+        of = [episode.agent == row.name for episode in gap.session.episodes if episode.agent in policies]
+        np.testing.assert_array_equal(together.expected[of], row.expected)
+
+
+@pytest.mark.usefixtures("few_bootstraps")
+def test_an_ended_session_is_compared_with_the_starts_that_it_had(tmp_path: Path, series: list[Responses]) -> None:
+    policies = {"p0": policy_of(0, series, robot=Anywhere())}
+    calibration = Calibration.of_series(series)
+    found = []
+    for budget in (Budget(), Budget(pulses=60)):
+        with FakeCulture() as culture:
+            account, folder = Account(budget), tmp_path / f"{budget.pulses}"
+            controls: dict[str, Any] = {"episodes": 4, "with_controls": False, "account": account}
+            found.append(run_policies(policies, culture, calibration, folder, **controls))
+    whole, part = (gap.rows[0] for gap in found)
+    assert found[1].session.ending.by == "budget" and 0 < len(part.measured) < 4 == len(whole.measured)
+    assert whole.expected is not None and part.expected is not None
+    np.testing.assert_array_equal(part.expected, whole.expected[: len(part.measured)])
+    assert part.predicted.mean() == pytest.approx(part.expected.mean())
+    assert len(part.predicted) == len(whole.predicted) * len(part.measured) // 4
+    # Nothing is known of one start from one episode.
+    with FakeCulture() as culture:
+        one = run_policies(policies, culture, calibration, tmp_path / "one", episodes=1, with_controls=False)
+    assert one.rows[0].turn is not None and one.rows[0].turn.tolist() == [0] and one.rows[0].gap.high == np.inf
+
+
+@pytest.mark.oracle
+def test_known_starts_make_intervals_narrower_and_still_right() -> None:
+    """Starts differ by three times as much as what follows them; some culture's responses to a start are unforeseen."""
+    rng, covered, widths = np.random.default_rng(8), np.zeros(2, np.int64), np.zeros(2)
+    row = Row("p", "", np.zeros(9), np.zeros(9), np.zeros(0), 1.0, 1.0, None, 0.0, 0.0, 0.0)
+    turn = np.repeat(np.arange(5), 4)
+    for _ in range(200):
+        from_start = rng.normal(0.0, 30.0, 5)
+        expected = from_start[turn]
+        predicted = (expected[:, None] + rng.normal(0.0, 10.0, (20, 200))).ravel()
+        measured = expected + rng.normal(0.0, 5.0, 5)[turn] + rng.normal(0.0, 10.0, 20)
+        means = np.full(9, predicted.mean())
+        known = replace(
+            row, predicted=predicted, bootstrap_means=means, measured=measured, turn=turn, expected=expected
+        ).gap
+        unknown = replace(row, measured=measured, turn=turn).gap
+        covered += [gap.low <= 0 <= gap.high for gap in (known, unknown)]
+        widths += [gap.high - gap.low for gap in (known, unknown)]
+        assert known.value == pytest.approx(measured.mean() - predicted.mean())
+    # 190 of 200, standard deviation 3.1.
+    assert 180 <= covered[0] <= 199 and 175 <= covered[1] <= 199
+    assert widths[0] < widths[1] / 3
 
 
 @pytest.mark.long

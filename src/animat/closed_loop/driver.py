@@ -29,6 +29,7 @@ from animat.cultures.failures import describe_error
 from animat.errors import AnimatError, BudgetSpent
 from animat.neurons.history_tracker import HistoryState
 from animat.responses.extraction import SILENCE_S
+from animat.robots.starts import robot_generator
 from animat.stimulation.schedule import TICK_S, on_ticks
 from animat.stimulation.stimulus import Stimulus
 
@@ -65,7 +66,7 @@ class Driver:
         loop, culture = self.loop, self.culture
         self.records: deque[Record] = deque()
         self._rng = np.random.default_rng([self.seed, 21])
-        self._runner = runner_of(loop.robot, np.random.default_rng([self.seed, 22]))
+        self._runner = runner_of(loop.robot, robot_generator(self.seed))
         if any(agent.switch_at is not None for agent in self.agents):
             # Compile now, like its step.
             self._runner.switch_goal(0)

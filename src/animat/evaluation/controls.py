@@ -69,9 +69,9 @@ class Control:
             environment = wrappers.GoalSwitch(environment, self.switch_at)
         return environment, simulator
 
-    def run(self, environment: Environment[Any], simulator: Neurons, *, episodes: int, seed: int) -> Episodes:
-        """Its episodes in the policies' environment and simulator, changed for it; errors as in `roll_out`."""
-        return roll_out(*self.within(environment, simulator), self.actor, episodes=episodes, seed=seed)
+    def run(self, environment: Environment[Any], simulator: Neurons, **settings: Any) -> Episodes:
+        """Its episodes in the policies' environment and simulator, changed for it; settings as for `roll_out`."""
+        return roll_out(*self.within(environment, simulator), self.actor, **settings)
 
 
 RANDOM = Control("random", "any action, equally likely", Uniform())

@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, Key, PRNGKeyArray
 from animat.compilation import COMPILER_OPTIONS
 from animat.environment import Environment, Neurons, State
 from animat.robots.host import Bodies, HostRobot, StepResult
+from animat.robots.starts import Starts
 
 AT_ONCE = 64
 """Bodies side by side: each may take megabytes, and more would not make a step cheaper."""
@@ -40,10 +41,12 @@ def roll_out_on_host(
     seed: int,
     *,
     alike: bool,
+    starts: Starts | None = None,
 ) -> Counts:
     """Run episodes of several actors, at most `AT_ONCE` side by side.
 
-    `seed` is that of the bodies' episodes; `alike`: whether all actors have the same ones.
+    `seed` is that of the bodies' episodes; `alike`: whether all actors have the same ones; `starts`: of a session whose
+    episodes they have instead, as in `animat.evaluation.rollouts.roll_out`.
     """
     n_conditions = 0 if simulator is None or environment.n_actions is None else environment.n_actions
     shape, presented = (len(keys), episodes), np.zeros((len(keys), n_conditions), np.int64)
@@ -57,7 +60,10 @@ def roll_out_on_host(
         for first in range(0, episodes, side_by_side):
             # The last wave may run more episodes than requested: the program is compiled for one number.
             numbers = range(len(keys))[some]
-            seeds = [(seed, 0 if alike else number, first + i) for number in numbers for i in range(side_by_side)]
+            of_wave = range(first, first + side_by_side)
+            seeds: Sequence[tuple[int, ...]] = [(seed, 0 if alike else n, i) for n in numbers for i in of_wave]
+            if starts is not None:
+                seeds = starts.seeds_of(of_wave) * len(numbers)
             folded = jax.vmap(jax.random.fold_in, (0, None))(keys[some], first)
             of_episodes = (each[some, first : first + side_by_side] for each in counts[:3])
             wave = Counts(*of_episodes, *(each[some] for each in counts[3:]))

@@ -11,7 +11,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Float, Float32, Float64, Int32, UInt16
+from jaxtyping import Array, Float, Float32, Float64, Int32, Key, UInt16
 
 from animat.arguments import checked_arguments
 from animat.environment import Animat, Environment, Neurons, WithoutNeurons
@@ -24,6 +24,7 @@ from animat.neurons.history import INITIAL_HISTORY
 from animat.progress import Part, Progress, Silent
 from animat.recordings.findings import Finding
 from animat.robots.grid import Grid, grid_for
+from animat.robots.starts import Starts
 from animat.wrappers import EpisodeLimit, NeuralObservation, ShuffledDelivery, TrialCosts, net_reward, unwrapped
 
 Case = tuple[Environment[Any], Neurons]
@@ -166,10 +167,10 @@ def best_returns(
     for start in range(0, len(cases), at_once):
         batch = cases[start : start + at_once]
         part = Part(progress, start, len(batch), len(cases))
-        on_coarse = _Programme(coarse, batch).run(None, seed, Part(part, 0, 1, 4))
+        on_coarse = _Programme(coarse, batch).run(None, _drawn(seed), Part(part, 0, 1, 4))
         programme = _Programme(fine, batch)
         tables = _Tables(fine, programme.n_layers, robot.episode_limit) if episodes else None
-        values = programme.run(tables, seed, Part(part, 1, 3, 4))
+        values = programme.run(tables, _drawn(seed), Part(part, 1, 3, 4))
         for case, (value, coarser) in enumerate(zip(values.tolist(), on_coarse.tolist(), strict=True)):
             run = math.nan, math.nan, math.nan, math.nan
             if tables is not None:
@@ -181,11 +182,20 @@ def best_returns(
 
 
 def optimal_values(
-    cases: Sequence[Case], grid: Grid, seed: int, progress: Progress | None = None
+    cases: Sequence[Case], grid: Grid, seed: int, progress: Progress | None = None, *, starts: Starts | None = None
 ) -> tuple[Float64[np.ndarray, " cases"], tuple[float, float]]:
-    """Only the values, of many cases on a given grid, and the lowest and the highest possible return."""
+    """Only the values, of many cases on a given grid, and the lowest and the highest possible return.
+
+    They are means over `starts`; None: over starts that the robot draws.
+    """
     programme = _Programme(grid, cases)
-    return programme.run(None, seed, progress or Silent()), programme.bounds
+    of = _drawn(seed) if starts is None else starts.of_episodes(starts.rounds)
+    return programme.run(None, of, progress or Silent()), programme.bounds
+
+
+def _drawn(seed: int) -> Key[Array, " starts"]:
+    """Keys from which the robot draws starts."""
+    return jax.random.split(jax.random.key(seed), _STARTS)
 
 
 def _expect_known(environment: Environment[Any]) -> None:
@@ -265,8 +275,10 @@ class _Programme:
         self._motion = Motion(robot, grid, nodes, uniforms)
         self.bounds = -math.inf, math.inf
 
-    def run(self, tables: _Tables | None, seed: int, progress: Progress) -> Float64[np.ndarray, " cases"]:
-        """Step back from the end of an episode to its start; return the value there, store all values in the tables."""
+    def run(
+        self, tables: _Tables | None, starts: Key[Array, " starts"], progress: Progress
+    ) -> Float64[np.ndarray, " cases"]:
+        """Step back from the end of an episode to its start; return the mean value there, store all in the tables."""
         grid = self._grid
         landings = self._motion.from_grid()
         pairs, weights = side_by_side(self._outcomes)
@@ -286,10 +298,9 @@ class _Programme:
             bellman_backup(values.reshape(-1), *landings, *led_to, remaining, *ends, before.reshape(-1))
             values, before = before, values
             progress.update(remaining + 1, self._robot.episode_limit)
-        starts = jax.vmap(self._robot.reset)(jax.random.split(jax.random.key(seed), _STARTS))
         first = np.array([INITIAL_HISTORY])
         at_first = [of_case.start + int(self._layer(case, first)[0]) for case, of_case in enumerate(self._layers)]
-        return self._mean_over(values[:, at_first], starts)
+        return self._mean_over(values[:, at_first], jax.vmap(self._robot.reset)(starts))
 
     def play(
         self, tables: _Tables, case: int, episodes: int, seed: int, *, clock: bool

@@ -23,6 +23,7 @@ from animat.goals.tally import Outcome
 from animat.neurons.simulator import stacked
 from animat.robots.base import MOST_AT_ONCE, capability
 from animat.robots.host import HostRobot
+from animat.robots.starts import Starts
 from animat.tables import briefly
 from animat.training.networks import Layer, Network, as_commands, draw_action, likeliest_action
 from animat.training.policy import Policy
@@ -187,7 +188,14 @@ def networks_of(policies: Sequence[Policy], *, greedy: bool = False) -> Networks
 
 
 def roll_out(
-    environment: Environment[Any], simulator: Neurons, actors: Actor, *, episodes: int, seed: int, alike: bool = False
+    environment: Environment[Any],
+    simulator: Neurons,
+    actors: Actor,
+    *,
+    episodes: int,
+    seed: int,
+    alike: bool = False,
+    starts: Starts | None = None,
 ) -> Episodes:
     """Run episodes of several actors on one simulator.
 
@@ -195,6 +203,7 @@ def roll_out(
         actors: one kind of actor, its arrays with a leading axis of actors.
         seed: decides every random draw, together with an actor's place.
         alike: whether all actors get the same random numbers, so that only their actions differ.
+        starts: where episodes start, those of the first round first; None: as the robot draws them.
 
     Raises InvalidArgument for fewer than one episode or more than fit, or a seed of more than 32 bits.
     """
@@ -204,8 +213,13 @@ def roll_out(
     keys = jax.random.split(jax.random.key(seed), 1 if alike else n_actors)
     keys = jnp.repeat(keys, n_actors, axis=0) if alike else keys
     if isinstance(environment.robot, HostRobot):
-        return Episodes(*roll_out_on_host(environment, episodes, simulator, actors, keys, seed, alike=alike))
-    *counted, terminated, outcome = jax.device_get(_roll_out(environment, episodes, simulator, actors, keys))
+        return Episodes(
+            *roll_out_on_host(environment, episodes, simulator, actors, keys, seed, alike=alike, starts=starts)
+        )
+    of_episodes = None if starts is None else starts.of_episodes(episodes)
+    *counted, terminated, outcome = jax.device_get(
+        _roll_out(environment, episodes, simulator, actors, keys, of_episodes)
+    )
     kinds = (np.float64, np.int64, np.int64, np.float64)
     returns, lengths, presented, commanded = (x.astype(kind) for x, kind in zip(counted, kinds, strict=True))
     return Episodes(returns, lengths, terminated, presented, commanded, outcome)
@@ -213,7 +227,12 @@ def roll_out(
 
 @partial(jax.jit, static_argnums=(0, 1), compiler_options=COMPILER_OPTIONS)
 def _roll_out(
-    environment: Environment[Any], episodes: int, simulator: Neurons, actors: Actor, keys: Key[Array, " actors"]
+    environment: Environment[Any],
+    episodes: int,
+    simulator: Neurons,
+    actors: Actor,
+    keys: Key[Array, " actors"],
+    starts: Key[Array, " episodes"] | None,
 ) -> tuple[Any, ...]:
     n_conditions = 0 if simulator is None or environment.n_actions is None else environment.n_actions
     n_drawn = environment.n_drawn
@@ -221,7 +240,7 @@ def _roll_out(
     def begin(key: PRNGKeyArray) -> tuple[tuple[Any, ...], Key[Array, " iterations"]]:
         start, key = jax.random.split(key)
         carry = (
-            jax.vmap(environment.reset)(jax.random.split(start, episodes)).carried,
+            jax.vmap(environment.reset)(jax.random.split(start, episodes) if starts is None else starts).carried,
             jnp.ones(episodes, bool),
             jnp.zeros(episodes),
             jnp.zeros(episodes, jnp.int32),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Hashable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
@@ -15,11 +16,14 @@ from jaxtyping import Float64
 from animat.environment import Environment
 from animat.evaluation.controls import Control, Delivered
 from animat.evaluation.rollouts import Episodes, Uniform
+from animat.evaluation.statistics import Interval
 from animat.process import own_cores
 from animat.progress import Progress, Silent
 from animat.reality_gap.calibration import Calibration
+from animat.reality_gap.row import bootstrap_interval
 from animat.reality_gap.session_responses import CommandSums
 from animat.robots.host import HostRobot
+from animat.robots.starts import Starts
 
 EPISODES = 200
 """Episodes of each policy and control in one roll-out."""
@@ -33,27 +37,38 @@ class Prediction(NamedTuple):
     """The predictions for one agent.
 
     Attributes:
-        returns: of its episodes on the recording's simulator.
-        bootstrap_means: its mean return on each bootstrap simulator; their spread is due to the recording's responses
-            and, a little, to the episodes.
+        returns: of its episodes on the recording's simulator, from each of the session's starts; in one row if all
+            episodes start alike.
+        bootstrap_means: its mean return on each bootstrap simulator, from each start; their spread is due to the
+            recording's responses and, a little, to the episodes.
         commanded: in all its episodes on the recording's simulator; `commanded_bootstraps`: on each bootstrap one.
     """
 
-    returns: Float64[np.ndarray, " episodes"]
-    bootstrap_means: Float64[np.ndarray, " bootstraps"]
+    returns: Float64[np.ndarray, "starts episodes"]
+    bootstrap_means: Float64[np.ndarray, "bootstraps starts"]
     commanded: CommandSums
     commanded_bootstraps: CommandSums
 
     @property
+    def interval(self) -> Interval:
+        """Mean return, with its interval over bootstrap samples of the recording's responses."""
+        return bootstrap_interval(self.returns.mean(), self.bootstrap_means.mean(axis=1))
+
+    @property
     def presented(self) -> Float64[np.ndarray, " conditions"]:
         """How often each condition is presented in an episode, on average."""
-        return np.asarray(self.commanded.presented / len(self.returns))
+        return np.asarray(self.commanded.presented / self.returns.size)
+
+    def of_start(self, number: int) -> Prediction:
+        """The same from one of the starts; what is commanded is of all."""
+        one = slice(number, number + 1)
+        return self._replace(returns=self.returns[one], bootstrap_means=self.bootstrap_means[:, one])
 
 
 def pool(predicted: Sequence[Prediction]) -> Prediction:
     """The predictions of several policies as one."""
     return Prediction(
-        np.concatenate([each.returns for each in predicted]),
+        np.concatenate([each.returns for each in predicted], axis=1),
         np.mean([each.bootstrap_means for each in predicted], axis=0),
         _stacked([each.commanded for each in predicted]).summed(0),
         _stacked([each.commanded_bootstraps for each in predicted]).summed(0),
@@ -72,22 +87,26 @@ def predict(
     calibration: Calibration,
     *,
     seed: int = 1,
+    starts: Starts | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Prediction]:
     """The prediction for each policy and control, by its name: on a recording's simulator and its bootstrap simulators.
 
-    The policies are side by side, with their `names`.
+    The policies are side by side, with their `names`. `starts` are those of the session, equally often each; None if
+    all episodes start alike.
     """
     progress = progress or Silent()
     simulators, episodes_each = [calibration.simulator] * ROLL_OUTS + list(calibration.bootstraps), EPISODES
     if isinstance(environment.robot, HostRobot):
         simulators = simulators[: ROLL_OUTS + BOOTSTRAPS_ON_HOST]
         episodes_each = episodes_on_host(environment.robot)
+    rounds = 1 if starts is None else starts.rounds
+    episodes_each = rounds * math.ceil(episodes_each / rounds)
     acting = [policies, *map(_with_random_actor, controls)]
 
     def run(number: int, on: int) -> Episodes:
         drawn = roll_out_seed(seed, number, on)
-        return acting[number].run(environment, simulators[on], episodes=episodes_each, seed=drawn)
+        return acting[number].run(environment, simulators[on], episodes=episodes_each, seed=drawn, starts=starts)
 
     predictions: dict[str, Prediction] = {}
     # A hanging body on the host is only noticed in the main thread (`animat.robots.host.time_limit`).
@@ -109,9 +128,10 @@ def predict(
                 rows = {control.name: [*range(control.actor.n_actors)]}
             for name, of in rows.items():
                 each = CommandSums(presented[:, of], total[:, of]).summed(1)
+                from_starts = returns[:, of].reshape(len(returns), -1, rounds)
                 predictions[name] = Prediction(
-                    returns[:ROLL_OUTS, of].ravel(),
-                    returns[ROLL_OUTS:, of].mean(axis=(1, 2)),
+                    from_starts[:ROLL_OUTS].reshape(-1, rounds).T,
+                    from_starts[ROLL_OUTS:].mean(axis=1),
                     CommandSums(*(sums[:ROLL_OUTS] for sums in each)).summed(0),
                     CommandSums(*(sums[ROLL_OUTS:] for sums in each)),
                 )

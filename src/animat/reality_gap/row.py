@@ -23,7 +23,8 @@ class Row:
     """A row of the table.
 
     Attributes:
-        predicted, bootstrap_means: as in a `Prediction`.
+        predicted, bootstrap_means: as in a `Prediction`, together from all starts; where starts differ, from those of
+            the measured episodes, one after the other.
         measured: returns of complete episodes on the culture.
         pulses_per_action: given to the culture, without the warm-up; the same holds for the measurements below.
         electrode_pulses: mean number per complete episode, one for each electrode of each pulse; NaN without episodes.
@@ -36,6 +37,7 @@ class Row:
         within: lowest and highest possible return of an episode.
         turn: which of its agent's episodes each measured one is, where starts are drawn: in the same turn all agents
             have the same start; None where all episodes start alike.
+        expected: mean predicted return from the start of each measured episode; None where all start alike.
     """
 
     name: str
@@ -53,6 +55,7 @@ class Row:
     met: dict[str, Any] = field(default_factory=dict)
     within: tuple[float, float] = (-np.inf, np.inf)
     turn: Int64[np.ndarray, " measured"] | None = None
+    expected: Float64[np.ndarray, " measured"] | None = None
 
     @property
     def prediction(self) -> Interval:
@@ -60,23 +63,32 @@ class Row:
         return bootstrap_interval(self.predicted.mean(), self.bootstrap_means)
 
     @property
+    def from_mean_start(self) -> Returns:
+        """Measured returns, less how much more or less is predicted from an episode's start than from all of them."""
+        return self.measured if self.expected is None else self.measured - self.expected + self.predicted.mean()
+
+    @property
     def gap(self) -> Interval:
         """Mean measured less mean predicted return; its interval is over bootstrap recordings and measured episodes.
 
-        Episodes of the same turn are drawn together. If measured episodes vary less than predicted ones, as when all
+        Where starts differ, an episode counts by how much more or less it returns than predicted from its start, and
+        episodes of the same turn are drawn together. If measured episodes vary less than predicted ones, as when all
         reach the limit, the interval is over as many predicted episodes instead: rare failures may have been missed.
         It ends where an episode's return does. The ends are infinite with fewer than two measured episodes, or turns.
         Responses are drawn as if they were independent: drift between recording and loop is not in the interval, and
         shows as a gap.
         """
         mean, expected = self.measured.mean(), self.predicted.mean()
-        drawn = resampled_means(self.measured, rng := np.random.default_rng(0), self.turn)
+        returns, chance = self.from_mean_start, self.predicted
+        if self.expected is not None:
+            chance = (chance.reshape(len(returns), -1) - self.expected[:, None]).ravel() + expected
+        drawn = resampled_means(returns, rng := np.random.default_rng(0), self.turn)
         if drawn is None:
             return Interval(float(mean - expected), -np.inf, np.inf, CONFIDENCE)
         fewest = len(self.measured if self.turn is None else np.unique(self.turn))
         # Episodes of a turn count once if they go alike, or if all go alike, and each by itself if they do not.
-        independent = int(np.clip(self.measured.var() / max(drawn.var(), 1e-12), fewest, len(self.measured)))
-        missed = expected - rng.choice(self.predicted, (len(drawn), independent)).mean(axis=1)
+        independent = int(np.clip(returns.var() / max(drawn.var(), 1e-12), fewest, len(self.measured)))
+        missed = expected - rng.choice(chance, (len(drawn), independent)).mean(axis=1)
         # A robot of one's own may return more than it says.
         limits = min(self.within[0], self.measured.min()), max(self.within[1], self.measured.max())
         measured = np.clip(mean + missed if missed.std() > drawn.std() else drawn, *limits)

@@ -32,15 +32,24 @@ from animat.goals.tally import Outcome
 from animat.progress import Progress, in_phase
 from animat.reality_gap.calibration import Calibration
 from animat.reality_gap.outlook import outlook
-from animat.reality_gap.predicting import BOOTSTRAPS_ON_HOST, ROLL_OUTS, Prediction, episodes_on_host, pool, predict
+from animat.reality_gap.predicting import (
+    BOOTSTRAPS_ON_HOST,
+    EPISODES,
+    ROLL_OUTS,
+    Prediction,
+    episodes_on_host,
+    pool,
+    predict,
+)
 from animat.reality_gap.reasons import Evidence, reasons
-from animat.reality_gap.row import Row, bootstrap_interval
+from animat.reality_gap.row import Row
 from animat.reality_gap.session_responses import outcomes, read_responses
 from animat.reality_gap.table import INTERVENTION_EPISODES, RealityGap, intervention_table
 from animat.recordings.findings import Finding, warnings_once
-from animat.robots.base import lacking
+from animat.robots.base import Robot, lacking
 from animat.robots.grid import grid_for, why_no_grid
 from animat.robots.host import HostRobot
+from animat.robots.starts import Starts
 from animat.training.policy import Policy, first_of_alike
 from animat.wrappers import NeuralObservation
 from animat.writing import expect_writable
@@ -117,6 +126,7 @@ def run_policies(
     environment: Environment[Any] = NeuralObservation(animat) if first.neural_observation else animat
     simulator = calibration.simulator
     networks = networks_of(list(policies.values()), greedy=greedy)
+    starts = _starts(loop.robot, seed, episodes)
     trained, controls = Control("policies", "as trained", networks), [RANDOM]
     lacks = lacking(loop.robot)
     if with_controls:
@@ -135,7 +145,7 @@ def run_policies(
             raise InvalidArgument(
                 f"--interventions: expected a robot in JAX, got {loop.robot.name}, which is stepped outside JAX"
             )
-        simulated = {"episodes": INTERVENTION_EPISODES, "seed": seed}
+        simulated = {"episodes": INTERVENTION_EPISODES, "seed": seed, "starts": starts}
         half_way = trained.run(environment, simulator, **simulated).half_way
         actuator, *changed = interventions_of(environment, simulator, networks, switch_at=half_way)
         ideal = actuator, actuator.run(environment, simulator, **simulated).returns.ravel()
@@ -150,7 +160,7 @@ def run_policies(
 
     # The optimal return meanwhile, on another core: a session must not wait for one.
     thread = ThreadPoolExecutor(1)
-    computed = thread.submit(_optimal_return, animat, calibration)
+    computed = thread.submit(_optimal_return, animat, calibration, starts)
     try:
         predicted = predict(
             trained,
@@ -160,6 +170,7 @@ def run_policies(
             # Fixed thresholds stay the same in bootstraps; adaptive ones would adapt to their responses.
             calibration if calibration.adaptive else calibration.with_percentiles(simulator.percentiles),
             seed=seed,
+            starts=starts,
             progress=in_phase(progress, "predicting"),
         )
     except Exception:
@@ -188,9 +199,9 @@ def run_policies(
         seed=seed,
         account=account,
         progress=in_phase(progress, "closed loop", sum(of_each), "episodes"),
-        predicted={name: bootstrap_interval(of.returns.mean(), of.bootstrap_means) for name, of in predicted.items()},
+        predicted={name: of.interval for name, of in predicted.items()},
     )
-    rows = _rows(agents, tuple(policies), predicted, session, loop, first.pulse_cost)
+    rows = _rows(agents, tuple(policies), predicted, session, loop, first.pulse_cost, starts)
     gap_reasons: tuple[Finding, ...] = ()
     if sign := rows[0].gap_sign:
         responses = read_responses(session, loop, tuple(policies))
@@ -245,13 +256,22 @@ def _warnings(first: Policy, loop: Loop, calibration: Calibration, age_min: floa
         yield Finding("few-predicted", "note", message)
 
 
+def _starts(robot: Robot[Any], seed: int, episodes: int) -> Starts | None:
+    """The starts of a session's rounds; None if all are alike, or too many to predict from each of them."""
+    starts = Starts.of_session(seed, episodes)
+    most = episodes_on_host(robot) if isinstance(robot, HostRobot) else EPISODES
+    return starts if 1 <= episodes <= most and starts.differ(robot) else None
+
+
 def planned_episodes(policies: int, controls: int, episodes: int) -> list[int]:
     """Episodes of each policy, then of each control, which has at most as many."""
     of_a_control = max(FEWEST_OF_A_CONTROL, math.ceil(policies * episodes / controls))
     return [episodes] * policies + [min(episodes, of_a_control)] * controls
 
 
-def _optimal_return(environment: Animat[Any], calibration: Calibration) -> tuple[float | None, tuple[Finding, ...]]:
+def _optimal_return(
+    environment: Animat[Any], calibration: Calibration, starts: Starts | None
+) -> tuple[float | None, tuple[Finding, ...]]:
     """The optimal return on the recording's simulator, or a finding that says why there is none."""
     robot, reason = environment.robot, why_no_grid(environment.robot)
     if few := too_few(calibration.conditions, [len(responses) for responses in calibration.responses_hz]):
@@ -260,7 +280,7 @@ def _optimal_return(environment: Animat[Any], calibration: Calibration) -> tuple
         try:
             # Only the value, which is reported as "about": its uncertainty would take a third longer.
             case = environment, calibration.simulator
-            (value,), _ = optimal_values([case], grid_for(robot).scaled(_RESOLUTION), seed=1)
+            (value,), _ = optimal_values([case], grid_for(robot).scaled(_RESOLUTION), 1, starts=starts)
             return float(value), ()
         except Exception as error:
             reason = describe_error(error)
@@ -288,36 +308,45 @@ def _rows(
     session: Session,
     loop: Loop,
     pulse_cost: float,
+    starts: Starts | None,
 ) -> tuple[Row, ...]:
     goal_outcomes, of_trials = outcomes(loop.robot, session), electrode_pulses(loop.conditions, loop.pulses)
     unstimulated = {agent.name for agent in agents if agent.delivery == "silent"}
     of_agents = {agent.name: [each.number for each in session.episodes if each.agent == agent.name] for agent in agents}
-    is_drawn = len({episode.start for episode in session.episodes}) > 1
+    is_drawn = starts is not None or len({episode.start for episode in session.episodes}) > 1
+    turn_of = {number: turn for numbers in of_agents.values() for turn, number in enumerate(numbers)}
 
     def row(name: str, meaning: str, of: Sequence[str]) -> Row:
         episodes = [episode for episode in session.episodes if episode.agent in of]
         whole = [each for each in episodes if each.is_whole]
         actions = max(1, sum(each.iterations for each in episodes))
         trials = max(1, sum(each.trials for each in episodes))
-        pooled = pool([predicted[each] for each in of])
+        every = pooled = pool([predicted[each] for each in of])
+        turn = expected = None
+        if is_drawn:
+            turn = np.array([turn_of[each.number] for each in whole], np.int64)
+            if whole and starts is not None:
+                pooled = pool([predicted[each.agent].of_start(turn_of[each.number]) for each in whole])
+                expected = pooled.returns.reshape(len(whole), -1).mean(axis=1)
         met = [goal_outcomes[episode.number] for episode in episodes if episode.number in goal_outcomes]
         return Row(
             name=name,
             meaning=meaning,
-            predicted=pooled.returns,
-            bootstrap_means=pooled.bootstrap_means,
+            predicted=pooled.returns.ravel(),
+            bootstrap_means=pooled.bootstrap_means.mean(axis=1),
             measured=np.array([episode.total for episode in whole], np.float64),
             pulses_per_action=sum(each.pulses - each.warm_up_pulses for each in episodes) / actions,
             electrode_pulses=sum(each.electrode_pulses for each in whole) / len(whole) if whole else math.nan,
             predicted_electrode_pulses=None
             if of_trials is None
-            else float(pooled.presented @ of_trials) * (name not in unstimulated),
+            else float(every.presented @ of_trials) * (name not in unstimulated),
             pulse_cost=pulse_cost,
             bursts=sum(each.bursts for each in episodes) / trials,
             late=sum(each.late for each in episodes) / trials,
             met=Outcome(*map(np.stack, zip(*met, strict=True))).means() if met else {},  # type: ignore[arg-type]
             within=loop.robot.return_range,
-            turn=np.array([of_agents[each.agent].index(each.number) for each in whole], np.int64) if is_drawn else None,
+            turn=turn,
+            expected=expected,
         )
 
     policies = row("policies" if len(names) > 1 else names[0], "as trained", names)

@@ -205,7 +205,7 @@ def intervention_table(rows: Sequence[Row], ideal: Control, with_ideal: Returns)
         Intervention(ideal.name, ideal.meaning, False, float(with_ideal.mean()), lost),
     ]
     for row in (measured[name] for name in _INTERVENTIONS if name in measured):
-        lost = _lost(rows[0], row.measured, row.turn)
+        lost = _lost(rows[0], row.from_mean_start, row.turn)
         table.append(Intervention(row.name, row.meaning, True, float(row.measured.mean()), lost))
     return tuple(table)
 
@@ -226,7 +226,7 @@ def _intervention_lines(policies: Row, table: Sequence[Intervention]) -> list[st
 def _lost(usual: Row, changed: Returns, turn: Turns | None) -> Interval:
     """Difference of means, with its interval over episodes (`resampled_means`); infinite where they are too few."""
     value, rng = float(usual.measured.mean() - changed.mean()), np.random.default_rng(0)
-    one, other = resampled_means(usual.measured, rng, usual.turn), resampled_means(changed, rng, turn)
+    one, other = resampled_means(usual.from_mean_start, rng, usual.turn), resampled_means(changed, rng, turn)
     if one is None or other is None:
         return Interval(value, -np.inf, np.inf, CONFIDENCE)
     low, high = np.quantile(one - other, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
