@@ -28,6 +28,7 @@ from animat.cultures.budget import Account, Budget
 from animat.cultures.devices.cl1 import CL1Culture
 from animat.cultures.kinds import culture_of, pulse_for, recorded_culture
 from animat.cultures.observed import Observed
+from animat.cultures.replay import ReplayCulture
 from animat.environment import Animat
 from animat.errors import InvalidArgument, Mismatch
 from animat.evaluation.controls import Control
@@ -58,6 +59,7 @@ from animat.robots import Cartpole, Navigation, Robot, Shuttle
 from animat.robots.starts import Starts
 from animat.stimulation.array import MAXONE
 from animat.stimulation.protocol import Presentation, Protocol
+from animat.stimulation.pulse import PUBLISHED_PULSE, Phase, Pulse
 from animat.stimulation.selection import Selection
 from animat.training.policy import Policy
 from animat.wrappers import ShuffledDelivery
@@ -706,6 +708,32 @@ def test_rows_know_which_episodes_have_the_same_start(
     assert turns == ([None] * 3 if isinstance(robot, Cartpole) else [[0, 0, 1, 1, 2, 2], [0, 1, 2], [0, 1, 2]])
     drawn = [episode for episode in gap.session.episodes if episode.agent in policies]
     assert all(one.start == other.start for one, other in zip(drawn[::2], drawn[1::2], strict=True))
+
+
+WEAK = Pulse((Phase(400.0, amplitude_mv=-90.0), Phase(400.0, amplitude_mv=90.0)))
+CURRENT = Pulse((Phase(160.0, amplitude_ua=-1.0), Phase(160.0, amplitude_ua=1.0)))
+
+
+@pytest.mark.usefixtures("few_bootstraps")
+@pytest.mark.parametrize("case", ["recorded", "given", "unknown", "replay", "replay of current"])
+def test_a_loop_delivers_what_its_recording_was_made_with(
+    case: str, tmp_path: Path, recordings: list[Recording], series: list[Responses]
+) -> None:
+    """Its pulse, on as many of the culture's patterns; also from Python, where both may be given."""
+    protocol = replace(PROTOCOL, pulse=CURRENT if case == "replay of current" else WEAK, patterns=3)
+    calibration = Calibration.of_series([replace(each, protocol=protocol) for each in series])
+    assert calibration.protocol == protocol and series[0].protocol == PROTOCOL == Calibration.of_series(series).protocol
+    settings: dict[str, Any] = {"episodes": 1, "with_controls": False}
+    settings |= {"pulse": PUBLISHED_PULSE, "patterns": 2} if case == "given" else {}
+    if case == "unknown":
+        calibration = replace(calibration, protocol=None)
+    policies = {"p0": policy_of(0, series)}
+    with ReplayCulture(recordings) if "replay" in case else FakeCulture() as culture:
+        gap = run_policies(policies, culture, calibration, tmp_path / "s", **settings)
+        n = {"given": 2, "unknown": len(culture.patterns)}.get(case, 3)
+    assert gap.loop.pulse == (WEAK if case in ("recorded", "replay") else PUBLISHED_PULSE)
+    assert {pattern for tick in gap.session.ticks for pattern in tick.patterns} == {*range(n)}
+    assert ("unknown-pulse" in {finding.name for finding in gap.findings}) == (case == "unknown")
 
 
 @pytest.mark.usefixtures("few_bootstraps")

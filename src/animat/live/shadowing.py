@@ -137,8 +137,6 @@ def live(
                 account=run.account,
                 progress=progress,
                 report=report,
-                pulse=protocol.pulse,
-                patterns=protocol.patterns,
                 **settings,
             )
         run.write("closed loop", **gap.session.to_dict())

@@ -25,7 +25,7 @@ from animat.responses.condition import Condition
 from animat.responses.quality.drift import MedianDrift, median_drift
 from animat.responses.readouts import ALL, Readouts
 from animat.responses.responses import Responses
-from animat.stimulation.protocol import Presentation
+from animat.stimulation.protocol import Presentation, Protocol
 from animat.tables import briefly
 from animat.training.policy import FITTED, Policy
 
@@ -48,6 +48,7 @@ class Calibration:
         start_min: of the recording on the culture's clock.
         fitted: how the simulators were fitted, as in `Policy.fitted`.
         adjusted: its responses, from which adaptive thresholds start.
+        protocol: by which it was recorded; None if it is not known.
         culture, recorded_at: which was recorded, and when; None if it is not known.
     """
 
@@ -67,6 +68,7 @@ class Calibration:
     fitted: dict[str, Any]
     adjusted: AdjustedRanks
     readouts: Readouts = ALL
+    protocol: Protocol | None = None
     culture: RecordedCulture | None = None
     recorded_at: datetime | None = None
 
@@ -148,6 +150,7 @@ class Calibration:
             fitted={name: timeline.fitted[name] for name in FITTED},
             readouts=timeline.readouts,
             adjusted=adjusted,
+            protocol=responses.protocol,
             culture=timeline.culture,
             recorded_at=responses.recorded_at,
         )

@@ -20,8 +20,9 @@ from animat.coding.encoder import electrode_pulses
 from animat.cultures.base import Culture
 from animat.cultures.budget import Account
 from animat.cultures.failures import describe_error
+from animat.cultures.replay import ReplayCulture
 from animat.environment import Animat, Environment
-from animat.errors import InvalidArgument, UnusableData
+from animat.errors import InvalidArgument, UnusableData, in_min
 from animat.evaluation import transfer
 from animat.evaluation.controls import RANDOM, Control, controls_of, coupling_of, interventions_of
 from animat.evaluation.optimal_returns import too_few
@@ -50,6 +51,7 @@ from animat.robots.base import Robot, lacking
 from animat.robots.grid import grid_for, why_no_grid
 from animat.robots.host import HostRobot
 from animat.robots.starts import Starts
+from animat.stimulation.pulse import PUBLISHED_PULSE
 from animat.training.policy import Policy, first_of_alike
 from animat.wrappers import NeuralObservation
 from animat.writing import expect_writable
@@ -102,7 +104,7 @@ def run_policies(
         progress: updated in each phase; in the closed loop with the returns so far.
         report: called with lines before the session: the warnings, and how long it will and can be.
         noticed: findings to report in addition to those made here.
-        settings: other attributes of `Loop`.
+        settings: other attributes of `Loop`; by default pulse and patterns are those of the calibrating recording.
 
     Raises:
         InvalidArgument: for no policies.
@@ -114,13 +116,14 @@ def run_policies(
     settings = {"burst_threshold": calibration.burst_threshold, **settings}
     if calibration.adaptive:
         settings["adaptive_from"] = calibration.adjusted
+    settings, unknown = _as_recorded(calibration, culture, settings)
     # The recording's conditions have their stimuli: older policies do not know those of patterns.
     settings["conditions"] = calibration.conditions
     if first.neural_observation:
         settings["remembering"] = calibration.remembering
     loop, findings = Loop.of_policy(first, calibration.percentiles, pulses=pulses, **settings)
     age_min = calibration.age_min(culture)
-    findings += tuple(_warnings(first, loop, calibration, age_min))
+    findings += unknown + tuple(_warnings(first, loop, calibration, age_min))
     account = account or Account()
     animat = Animat(loop.robot, loop.mapping, len(loop.conditions))
     environment: Environment[Any] = NeuralObservation(animat) if first.neural_observation else animat
@@ -219,6 +222,28 @@ def run_policies(
         reasons=gap_reasons,
         whose_work=() if ideal is None else intervention_table(rows, *ideal),
     )
+
+
+def _as_recorded(
+    calibration: Calibration, culture: Culture, settings: dict[str, Any]
+) -> tuple[dict[str, Any], tuple[Finding, ...]]:
+    """Settings with the pulse and the patterns of the calibrating recording, and a finding if it does not state them.
+
+    A replay responds alike to every pulse, and its limits are those of voltages.
+    """
+    protocol = calibration.protocol
+    if protocol is not None:
+        own: dict[str, Any] = {"patterns": min(protocol.patterns, len(culture.patterns))}
+        if not isinstance(culture, ReplayCulture) or protocol.pulse.kind == PUBLISHED_PULSE.kind:
+            own["pulse"] = protocol.pulse
+        return own | settings, ()
+    if "pulse" in settings:
+        return settings, ()
+    message = (
+        f"the recording at {in_min(calibration.start_min)}, which calibrates the loop, does not state its pulse: the "
+        f"loop delivers {PUBLISHED_PULSE}, the usual one; to change it, give `pulse`"
+    )
+    return settings, (Finding("unknown-pulse", "warning", message),)
 
 
 def _warnings(first: Policy, loop: Loop, calibration: Calibration, age_min: float) -> Iterator[Finding]:

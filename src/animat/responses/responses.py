@@ -17,7 +17,7 @@ from animat.recordings.recording import Channels
 from animat.responses.condition import Condition
 from animat.responses.conditions import NO_CONDITION
 from animat.responses.readouts import ALL, Readouts
-from animat.stimulation.protocol import Presentation
+from animat.stimulation.protocol import Presentation, Protocol
 from animat.tables import briefly, read_only
 
 if TYPE_CHECKING:
@@ -61,7 +61,8 @@ class Responses:
         window_ms: start and end of the window, after the last pulse of each trial.
         n_channels: the number of channels over which x is a mean.
         threshold, separability: of the active ratio, see `animat.responses.bursts.BurstSeparation`.
-        presentation: how stimuli were presented; None if it is not known.
+        presentation: how stimuli were presented; None if it is not known. `protocol`: by which they were delivered;
+            None if it is not known.
         start_min: start of the recording on the culture's clock, in minutes.
         time_s: of the pulse before each response, on the recording's clock, shape (responses,); None if not known.
         presented: all trials, including those without a condition; None: these responses are all (see `presentations`).
@@ -102,6 +103,7 @@ class Responses:
     channels: Channels | None = None
     readouts: Readouts = ALL
     readout_hz: Float64[np.ndarray, "responses *readouts"] | None = None
+    protocol: Protocol | None = None
 
     def __post_init__(self) -> None:
         shape = (len(self),)

@@ -192,7 +192,6 @@ class Measure(RobotTask):
         shutil.rmtree(session, ignore_errors=True)
         culture = VirtualCulture(self.culture)
         culture.restore_state(self.recordings(folder, self.n_commands) / STATE_FILE)
-        stimuli = protocol_for(self.n_commands)
         with culture:
             gap = run_policies(
                 policies,
@@ -202,8 +201,6 @@ class Measure(RobotTask):
                 episodes=self.study.episodes_measured,
                 with_coupling=True,
                 seed=self.seed_for("measure"),
-                pulse=stimuli.pulse,
-                patterns=stimuli.patterns,
                 # Best coupling, prediction, optimal return, closed loop.
                 progress=EqualPhases(progress, 4),
             )
