@@ -721,12 +721,12 @@ def test_a_loop_delivers_what_its_recording_was_made_with(
 ) -> None:
     """Its pulse, on as many of the culture's patterns; also from Python, where both may be given."""
     protocol = replace(PROTOCOL, pulse=CURRENT if case == "replay of current" else WEAK, patterns=3)
-    calibration = Calibration.of_series([replace(each, protocol=protocol) for each in series])
-    assert calibration.protocol == protocol and series[0].protocol == PROTOCOL == Calibration.of_series(series).protocol
+    made = [replace(each.recording, protocol=protocol) for each in series if each.recording is not None]
+    calibration = Calibration.of_series([replace(each, recording=of) for each, of in zip(series, made, strict=True)])
     settings: dict[str, Any] = {"episodes": 1, "with_controls": False}
     settings |= {"pulse": PUBLISHED_PULSE, "patterns": 2} if case == "given" else {}
     if case == "unknown":
-        calibration = replace(calibration, protocol=None)
+        calibration = replace(calibration, recording=replace(made[0], protocol=None))
     policies = {"p0": policy_of(0, series)}
     with ReplayCulture(recordings) if "replay" in case else FakeCulture() as culture:
         gap = run_policies(policies, culture, calibration, tmp_path / "s", **settings)
@@ -734,6 +734,25 @@ def test_a_loop_delivers_what_its_recording_was_made_with(
     assert gap.loop.pulse == (WEAK if case in ("recorded", "replay") else PUBLISHED_PULSE)
     assert {pattern for tick in gap.session.ticks for pattern in tick.patterns} == {*range(n)}
     assert ("unknown-pulse" in {finding.name for finding in gap.findings}) == (case == "unknown")
+
+
+@pytest.mark.usefixtures("few_bootstraps")
+def test_another_culture_than_the_recorded_one_is_noticed_from_python_too(
+    tmp_path: Path, series: list[Responses]
+) -> None:
+    recording = series[1].recording
+    assert recording is not None and not len(recording.spike_times_s) and len(recording.stimuli.time_s)
+    stimuli = replace(recording.stimuli, electrodes=recording.stimuli.electrodes[:, :1])
+    channels = replace(recording.channels, electrode=recording.channels.electrode + 1)
+    calibration = Calibration.of_series(series)
+    found = []
+    for of in (recording, replace(recording, stimuli=stimuli, channels=channels)):
+        with FakeCulture() as culture:
+            known = replace(calibration, recording=of)
+            policies, folder = {"p0": policy_of(0, series)}, tmp_path / f"{len(found)}"
+            gap = run_policies(policies, culture, known, folder, episodes=1, with_controls=False)
+        found.append([each.name for each in gap.findings if each.name.startswith("other-")])
+    assert found == [[], ["other-channels", "other-patterns"]]
 
 
 @pytest.mark.usefixtures("few_bootstraps")

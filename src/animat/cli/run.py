@@ -83,7 +83,6 @@ class Run(StimulationOptions):
         from animat.closed_loop.loop import Loop
         from animat.closed_loop.session import expect_no_session
         from animat.compilation import keep_compilations
-        from animat.cultures.same_culture import other_channels, other_culture, other_patterns
         from animat.neurons.simulator import check_binning
         from animat.reality_gap import run_policies
         from animat.recordings.reading import read_recordings
@@ -118,9 +117,6 @@ class Run(StimulationOptions):
         with ExitStack() as stack, exclusive_lock(self.out), Bar("culture") as progress:
             expect_no_session(self.out)
             with self._culture(recordings, calibrating, loop.pulse, progress) as culture:
-                noticed = [*unknown, other_culture(calibrating, culture), other_channels(calibrating, culture)]
-                if loop.encoder.takes_patterns:
-                    noticed.append(other_patterns(calibrating, culture))
                 gap = run_policies(
                     policies,
                     culture,
@@ -135,7 +131,7 @@ class Run(StimulationOptions):
                     account=account,
                     progress=progress,
                     report=partial(print, file=sys.stderr),
-                    noticed=tuple(filter(None, noticed)),
+                    noticed=unknown,
                     pulse=loop.pulse,
                     # All, if the recordings do not state how many they used.
                     patterns=None if unknown else min(protocol.patterns, len(culture.patterns)),

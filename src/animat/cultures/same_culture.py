@@ -11,6 +11,13 @@ from animat.recordings.recording import Recording
 from animat.tables import UNKNOWN
 
 
+def differences(recording: Recording, culture: Culture, *, patterns_too: bool) -> tuple[Finding, ...]:
+    """Warnings where an open culture is not, or not in all, the recorded one; `patterns_too`: if they are used."""
+    found = other_culture(recording, culture), other_channels(recording, culture)
+    also = (other_patterns(recording, culture),) if patterns_too else ()
+    return tuple(finding for finding in (*found, *also) if finding is not None)
+
+
 def other_culture(recording: Recording, culture: Culture) -> Finding | None:
     """A warning where an open culture is not the recorded one; None where it is, or where that cannot be known.
 

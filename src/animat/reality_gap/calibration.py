@@ -21,11 +21,12 @@ from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import Kind, fit_simulator, fit_timeline, room_for
 from animat.recordings.findings import Finding
 from animat.recordings.recorded_culture import RecordedCulture
+from animat.recordings.recording import Recording
 from animat.responses.condition import Condition
 from animat.responses.quality.drift import MedianDrift, median_drift
 from animat.responses.readouts import ALL, Readouts
 from animat.responses.responses import Responses
-from animat.stimulation.protocol import Presentation, Protocol
+from animat.stimulation.protocol import Presentation
 from animat.tables import briefly
 from animat.training.policy import FITTED, Policy
 
@@ -48,7 +49,7 @@ class Calibration:
         start_min: of the recording on the culture's clock.
         fitted: how the simulators were fitted, as in `Policy.fitted`.
         adjusted: its responses, from which adaptive thresholds start.
-        protocol: by which it was recorded; None if it is not known.
+        recording: without its spikes; None for one that has none, as a table of responses.
         culture, recorded_at: which was recorded, and when; None if it is not known.
     """
 
@@ -68,7 +69,7 @@ class Calibration:
     fitted: dict[str, Any]
     adjusted: AdjustedRanks
     readouts: Readouts = ALL
-    protocol: Protocol | None = None
+    recording: Recording | None = None
     culture: RecordedCulture | None = None
     recorded_at: datetime | None = None
 
@@ -150,7 +151,7 @@ class Calibration:
             fitted={name: timeline.fitted[name] for name in FITTED},
             readouts=timeline.readouts,
             adjusted=adjusted,
-            protocol=responses.protocol,
+            recording=responses.recording,
             culture=timeline.culture,
             recorded_at=responses.recorded_at,
         )

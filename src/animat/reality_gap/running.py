@@ -21,6 +21,7 @@ from animat.cultures.base import Culture
 from animat.cultures.budget import Account
 from animat.cultures.failures import describe_error
 from animat.cultures.replay import ReplayCulture
+from animat.cultures.same_culture import differences
 from animat.environment import Animat, Environment
 from animat.errors import InvalidArgument, UnusableData, in_min
 from animat.evaluation import transfer
@@ -123,7 +124,9 @@ def run_policies(
         settings["remembering"] = calibration.remembering
     loop, findings = Loop.of_policy(first, calibration.percentiles, pulses=pulses, **settings)
     age_min = calibration.age_min(culture)
-    findings += unknown + tuple(_warnings(first, loop, calibration, age_min))
+    if calibration.recording is not None:
+        unknown += differences(calibration.recording, culture, patterns_too=loop.encoder.takes_patterns)
+    findings = unknown + findings + tuple(_warnings(first, loop, calibration, age_min))
     account = account or Account()
     animat = Animat(loop.robot, loop.mapping, len(loop.conditions))
     environment: Environment[Any] = NeuralObservation(animat) if first.neural_observation else animat
@@ -231,7 +234,7 @@ def _as_recorded(
 
     A replay responds alike to every pulse, and its limits are those of voltages.
     """
-    protocol = calibration.protocol
+    protocol = None if calibration.recording is None else calibration.recording.protocol
     if protocol is not None:
         own: dict[str, Any] = {"patterns": min(protocol.patterns, len(culture.patterns))}
         if not isinstance(culture, ReplayCulture) or protocol.pulse.kind == PUBLISHED_PULSE.kind:

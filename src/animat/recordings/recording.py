@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from datetime import datetime
 from types import MappingProxyType
 from typing import Any, ClassVar, Literal
@@ -143,6 +143,10 @@ class Recording:
     def stop_s(self) -> float:
         """End of the recording on its own clock, in seconds."""
         return self.start_s + self.duration_s
+
+    def without_spikes(self) -> Recording:
+        """The same without its spikes, which take by far the most room."""
+        return replace(self, spike_times_s=np.empty(0), spike_channels=np.empty(0, np.int64))
 
     def equals(self, other: Recording) -> bool:
         """Whether all arrays and values of the two recordings are equal (NaN equals NaN)."""

@@ -134,7 +134,7 @@ def extract_responses(
         channels=source.channels,
         readouts=readouts,
         readout_hz=readout_hz,
-        protocol=source.protocol if isinstance(source, Recording) else None,
+        recording=source.without_spikes() if isinstance(source, Recording) else None,
     )
     return replace(responses, findings=(*assumed, *findings_on(responses, source, assignment, bursts, inside)))
 

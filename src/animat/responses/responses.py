@@ -13,11 +13,11 @@ from jaxtyping import Bool, Float64, Int64
 from animat.errors import Mismatch, UnusableData
 from animat.recordings.findings import Finding
 from animat.recordings.recorded_culture import RecordedCulture
-from animat.recordings.recording import Channels
+from animat.recordings.recording import Channels, Recording
 from animat.responses.condition import Condition
 from animat.responses.conditions import NO_CONDITION
 from animat.responses.readouts import ALL, Readouts
-from animat.stimulation.protocol import Presentation, Protocol
+from animat.stimulation.protocol import Presentation
 from animat.tables import briefly, read_only
 
 if TYPE_CHECKING:
@@ -61,8 +61,7 @@ class Responses:
         window_ms: start and end of the window, after the last pulse of each trial.
         n_channels: the number of channels over which x is a mean.
         threshold, separability: of the active ratio, see `animat.responses.bursts.BurstSeparation`.
-        presentation: how stimuli were presented; None if it is not known. `protocol`: by which they were delivered;
-            None if it is not known.
+        presentation: how stimuli were presented; None if it is not known.
         start_min: start of the recording on the culture's clock, in minutes.
         time_s: of the pulse before each response, on the recording's clock, shape (responses,); None if not known.
         presented: all trials, including those without a condition; None: these responses are all (see `presentations`).
@@ -73,6 +72,7 @@ class Responses:
         channels: those over which x is a mean; None if they are not known.
         readouts: the groups of channels read; by default all channels as one.
         readout_hz: x of each readout, shape (responses, readouts), or (responses,) for one; None: it is `rate_hz`.
+        recording: without its spikes; None for responses that were not extracted from one.
 
     Raises:
         Mismatch: for columns of different lengths, or a condition that is not in the list.
@@ -103,7 +103,7 @@ class Responses:
     channels: Channels | None = None
     readouts: Readouts = ALL
     readout_hz: Float64[np.ndarray, "responses *readouts"] | None = None
-    protocol: Protocol | None = None
+    recording: Recording | None = None
 
     def __post_init__(self) -> None:
         shape = (len(self),)
