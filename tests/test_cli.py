@@ -828,6 +828,7 @@ def test_an_error_of_an_argument_begins_with_its_option(
         ),
         (["train", "cartpole", "--polices", "3"], 2, ["animat: unknown option --polices; did you mean --policies?"]),
         (["record", "--sesions=2"], 2, ["animat: unknown option --sesions=2; did you mean --sessions?"]),
+        (["record", "--culture-seed", "7"], 2, ["animat: unknown option --culture-seed; did you mean --seed?"]),
         (["record", "--zzz"], 2, ["animat: unknown option --zzz; see animat record --help"]),
         (["convert", "a.csv", "--uot", "b.nwb"], 2, ["animat: unknown option --uot; did you mean --out?"]),
         (["--hepl"], 2, ["animat: unknown option --hepl; did you mean --help?"]),

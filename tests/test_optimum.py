@@ -16,11 +16,12 @@ from animat.coding.mapping import Linear, Thresholds
 from animat.environment import Animat, WithoutNeurons
 from animat.errors import InvalidArgument, Mismatch
 from animat.evaluation.commands import Commands, commands_of, nodes_for
-from animat.evaluation.optimum import best_return, best_returns, bracket_findings
+from animat.evaluation.optimum import Optimum, best_return, best_returns, bracket_findings
 from animat.evaluation.rollouts import Constant, Uniform, roll_out
 from animat.evaluation.sweeping import bellman_backup, cubic, look_ahead
 from animat.neurons.simulator import EmpiricalSimulator
 from animat.neurons.synthetic import synthetic_simulator
+from animat.report.results import StudyOptimum
 from animat.robots.base import Quantity, Robot
 from animat.robots.cartpole import Cartpole
 from animat.robots.grid import Axis, Grid, grid_for
@@ -250,6 +251,15 @@ def test_a_value_that_its_controller_does_not_reach_is_reported() -> None:
     """A difference of 3 standard errors plus the grid's error is chance; a larger one a bracket or a coarse grid."""
     assert not bracket_findings(100.0, 0.5, 98.1, 0.5)
     assert not bracket_findings(23.904, 0.001, 23.902, 0.0)  # deterministic: the two look the same when printed
+    # What is achieved without knowing the time left is achieved.
+    optimum = Optimum(100.0, 0.5, 90.0, 0.5, 99.0, 0.5, 100, 1000)
+    assert not optimum.findings() and replace(optimum, without_clock=97.0).findings()[0].value == 3.0
+    assert not replace(optimum, monte_carlo=99.0, without_clock=90.0).findings()
+    row = StudyOptimum("cartpole", "linear", "first", 0.0, 100.0, None, None, 0.5, 90.0, 0.5, 99.0, 0.5, 1000, None)
+    assert row.findings() == () and replace(row, without_clock=97.0).findings() == (
+        replace(optimum, without_clock=97.0).findings()
+    )
+    assert replace(row, without_clock=None).findings()[0].value == 10.0
     (above,) = bracket_findings(100.0, 0.5, 97.9, 0.5)
     assert "between the two" in above.message and above.value == pytest.approx(2.1)
     (below,) = bracket_findings(100.0, 0.5, 102.1, 0.5)

@@ -174,6 +174,9 @@ def test_the_table_holds_what_the_simulator_and_the_session_say(
     for name, returns in measured.items():
         np.testing.assert_allclose(rows[name].measured, returns)
         assert len(returns) == 4
+    # The table outlives the terminal.
+    assert (tmp_path / "returns.txt").read_text() == f"{gap.to_text()}\n"
+    assert json.loads((tmp_path / "returns.json").read_text()) == json.loads(json.dumps(gap.to_dict()))
     np.testing.assert_allclose(np.sort(rows["policies"].measured), np.sort(measured["p0"] + measured["p1"]))
 
     calibration = Calibration.of_series(series)
@@ -753,6 +756,21 @@ def test_another_culture_than_the_recorded_one_is_noticed_from_python_too(
             gap = run_policies(policies, culture, known, folder, episodes=1, with_controls=False)
         found.append([each.name for each in gap.findings if each.name.startswith("other-")])
     assert found == [[], ["other-channels", "other-patterns"]]
+
+
+@pytest.mark.usefixtures("few_bootstraps")
+def test_a_table_that_cannot_be_written_is_still_returned(tmp_path: Path, series: list[Responses]) -> None:
+    (tmp_path / "s" / "returns.txt").mkdir(parents=True)
+    with FakeCulture() as culture:
+        gap = run_policies(
+            {"p0": policy_of(0, series)},
+            culture,
+            Calibration.of_series(series),
+            tmp_path / "s",
+            episodes=1,
+            with_controls=False,
+        )
+    assert "returns.txt" in gap.session.ending.message and "cannot be written" in gap.to_text()
 
 
 @pytest.mark.usefixtures("few_bootstraps")

@@ -11,13 +11,19 @@ import numpy as np
 import pytest
 
 from animat.cli import main
+from animat.neurons.timeline import load_timeline
+from animat.progress import Silent
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.recording import Recording
 from animat.stimulation.protocol import Presentation
+from animat.studies.recording import Fit
+from animat.studies.specification import Simulators
+from animat.studies.toml import read_study
 from test_responses import recording
 
 pytestmark = pytest.mark.usefixtures("in_this_process")
 
+TINY = Path(__file__).parent / "tiny_study.toml"
 QUICK = ["--policies", "1", "--iterations", "64"]
 WARNED = ("other-presentation", "other-calibration", "old-calibration", "other-recording", "no-memory")
 
@@ -121,6 +127,21 @@ def test_a_memory_that_the_simulator_lacks_is_reported(tmp_path: Path, capsys: p
         out = str(tmp_path / f"p{len(simulator)}")
         train = ["train", "cartpole", "--recordings", recordings, *QUICK, *simulator, "--out", out]
         assert warned(ran(capsys, *train)) == found
+
+
+@pytest.mark.parametrize(
+    ("order", "kind", "found"),
+    [("mixed", "histogram", True), ("mixed", "memory", False), ("blocked", "histogram", False)],
+)
+def test_a_study_reports_the_memory_that_its_simulators_lack(
+    order: str, kind: Any, found: bool, tmp_path: Path
+) -> None:
+    """Not of recordings in blocks, from which nothing else can be made."""
+    series(tmp_path / "recordings", a_recording(0, order, memory=True))
+    study = replace(read_study(TINY), simulators=Simulators(kind=kind), comparisons=())
+    kept, _ = Fit(study).run(tmp_path, Silent())
+    warnings = [each.message for each in load_timeline(kept).findings if each.name == "no-memory"]
+    assert len(warnings) == found and all('(simulators.kind = "memory")' in message for message in warnings)
 
 
 @pytest.mark.oracle

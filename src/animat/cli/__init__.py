@@ -273,7 +273,10 @@ def _expect_known(unknown: Sequence[str], options: Mapping[str, Any], see: str) 
         if option in options:
             raise InvalidArgument(f"{option[2:]}: expected only its value, got {argument} before it{see}") from None
         if argument.startswith("-"):
-            raise InvalidArgument(f"unknown option {argument}{did_you_mean(option, options) or see}") from None
+            # As in the commands that stimulate a culture besides; only `record` has sessions.
+            is_meant = option == "--culture-seed" and "--sessions" in options
+            hint = "; did you mean --seed?" if is_meant else did_you_mean(option, options) or see
+            raise InvalidArgument(f"unknown option {argument}{hint}") from None
         hint = "; recordings are named after --recordings" if "--recordings" in options else ""
         raise InvalidArgument(f"unexpected argument {argument!r}{hint}{see}") from None
 

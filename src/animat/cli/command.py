@@ -159,7 +159,7 @@ class SimulatorOptions(ResponseOptions):
     training"""
     bins: int | None = None
     """Bins of a histogram, which is then the simulator; default: 20; in evaluate and replay: as in the policies'
-    training"""
+    training, and only with a histogram (--simulator histogram)"""
     range_hz: float | None = None
     """Equally wide bins from 0 to this rate, in Hz (the paper: 120); default: edges at percentiles of each recording;
     in evaluate and replay: as in the policies' training"""

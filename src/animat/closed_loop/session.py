@@ -177,6 +177,7 @@ class Session:
             "ended_by": self.ending.by,
             "ended": self.ending.message,
             "episodes": len(outline.episodes),
+            "whole_episodes": sum(episode.is_whole for episode in outline.episodes),
             "ticks": outline.ticks,
             "pulses": outline.pulses,
             "bursts": outline.bursts,

@@ -88,7 +88,9 @@ class Optimum:
 
     def findings(self) -> tuple[Finding, ...]:
         """A warning if the value and its controller's return differ by more than chance and the grid's error."""
-        return bracket_findings(self.value, self.grid_error, self.monte_carlo, self.standard_error)
+        known = self.monte_carlo, self.standard_error
+        unknown = self.without_clock, self.without_clock_standard_error
+        return bracket_findings(self.value, self.grid_error, *max(known, unknown))
 
 
 def bracket_findings(value: float, grid_error: float, monte_carlo: float, error: float) -> tuple[Finding, ...]:

@@ -244,8 +244,10 @@ class _Run:
             mean = "" if math.isnan(trainers.mean_return) else f", return {trainers.mean_return:.1f}"
             note = f"{counted(len(self.files), 'recording')}, {counted(len(self.swaps), 'swap')}{mean}"
             if time.monotonic() >= due_s:
-                note += "; waiting for all policies to train on the last recording"
+                note += "; waiting for all policies to train on the newest recording"
             progress.update(min(passed_min, minute), self.timetable.duration_min, note)
+        # A virtual culture's rest is computed now, which takes seconds.
+        progress.update(minute, self.timetable.duration_min, "the culture rests until its next recording is due")
         self.culture.rest(max(0.0, self._zero_s + 60 * minute - self.culture.now_s))
 
     def _record(self, number: int, progress: Progress) -> SimulatorTimeline | None:

@@ -23,7 +23,7 @@ from animat.cultures.failures import describe_error
 from animat.cultures.replay import ReplayCulture
 from animat.cultures.same_culture import differences
 from animat.environment import Animat, Environment
-from animat.errors import InvalidArgument, UnusableData, in_min
+from animat.errors import InvalidArgument, InvalidFile, UnusableData, in_min
 from animat.evaluation import transfer
 from animat.evaluation.controls import RANDOM, Control, controls_of, coupling_of, interventions_of
 from animat.evaluation.optimal_returns import too_few
@@ -84,6 +84,8 @@ def run_policies(
     **settings: Any,
 ) -> RealityGap:
     """Run policies and controls in closed loop, and compare with the prediction.
+
+    The table is also written into the session's folder, as `returns.txt` and `returns.json`.
 
     All episodes are interleaved in random order on the one culture, so that drift affects all alike. The controls
     together have no more episodes than the policies, except that each has at least `FEWEST_OF_A_CONTROL`: stimulation
@@ -212,7 +214,7 @@ def run_policies(
     if sign := rows[0].gap_sign:
         responses = read_responses(session, loop, tuple(policies))
         gap_reasons = reasons(Evidence(responses, calibration, pool([predicted[p] for p in policies]), sign))
-    return RealityGap(
+    gap = RealityGap(
         loop=loop,
         calibrated_at_min=calibration.start_min,
         optimum=optimum,
@@ -225,6 +227,13 @@ def run_policies(
         reasons=gap_reasons,
         whose_work=() if ideal is None else intervention_table(rows, *ideal),
     )
+    try:
+        gap.write()
+    except InvalidFile as error:
+        # It can still be printed.
+        ending = replace(session.ending, message=f"{session.ending.message}; {error}")
+        return replace(gap, session=replace(session, ending=ending))
+    return gap
 
 
 def _as_recorded(

@@ -21,9 +21,12 @@ from animat.reality_gap.outlook import Outlook
 from animat.reality_gap.reasons import CHECKS
 from animat.reality_gap.row import Returns, Row, Turns, resampled_means
 from animat.recordings.findings import Finding
-from animat.records import as_json
+from animat.records import as_json, write_json
 from animat.tables import briefly
+from animat.writing import write_whole
 
+TABLE_FILE = "returns"
+"""Name of the files with the table in a session's folder."""
 LARGE_SHARE = 0.1
 """Share of the range from random to optimal return: a gap this large is mentioned even if it may be chance."""
 
@@ -136,6 +139,11 @@ class RealityGap:
             **({"objectives": list(objectives)} if (objectives := objectives_of(self.loop.robot)) else {}),
         }
 
+    def write(self) -> None:
+        """Write the table into the session's folder, for people and as data; InvalidFile if it cannot be written."""
+        write_whole(self.session.folder / f"{TABLE_FILE}.txt", f"{self.to_text()}\n")
+        write_json(self.session.folder / f"{TABLE_FILE}.json", self.to_dict())
+
     def to_text(self) -> str:
         """A table for a terminal."""
         cells, objectives, cost = [], objectives_of(self.loop.robot), self.rows[0].pulse_cost
@@ -168,7 +176,7 @@ class RealityGap:
             share = ""
             if self.gap_share is not None:
                 share = f"; the policies' gap is {100 * self.gap_share:+z.0f} % of the range from random to it"
-            lines.append(f"  the optimal return on this simulator is about {self.optimum:.1f}{share}")
+            lines.append(f"  the optimal return on this simulator is at most about {self.optimum:.1f}{share}")
         if cost:
             ignores = "" if self.optimum is None else "; the optimal return ignores the cost"
             lines.append(f"  electrode pulses: per episode; net: return - {cost:g} x electrode pulses{ignores}")
@@ -176,8 +184,9 @@ class RealityGap:
         outline = self.session.outline
         lines += [
             f"  {self.verdict()}",
-            "  p value: of the two-sided Mann-Whitney test of the policies' returns against this control's; electrode "
-            "pulses: per whole episode, one for each electrode of each pulse",
+            "  p value: of the two-sided Mann-Whitney test of the policies' returns against this control's, by the "
+            "normal approximation, which is too small where episodes are few; electrode pulses: per whole episode, one "
+            "for each electrode of each pulse",
             f"  stimulation: {self.account}",
             f"  ticks: {outline.ticks}, bursts: {outline.bursts}, late pulses: {outline.late}"
             f" (the latest {1000 * outline.latest_s:.1f} ms); ended: {self.session.ending.message}",

@@ -39,10 +39,12 @@ class StudyOptimum:
     left_out: str | None
 
     def findings(self) -> tuple[Finding, ...]:
-        """A finding if the value and its controller's return differ."""
-        bracket = (self.best_return, self.grid_error, self.monte_carlo, self.standard_error)
-        known = [value for value in bracket if value is not None]
-        return bracket_findings(*known) if len(known) == len(bracket) else ()
+        """A finding if the value and the better return of its controller differ."""
+        runs = (self.monte_carlo, self.standard_error), (self.without_clock, self.without_clock_standard_error)
+        achieved = [(mean, error) for mean, error in runs if mean is not None and error is not None]
+        if self.best_return is None or self.grid_error is None or not achieved:
+            return ()
+        return bracket_findings(self.best_return, self.grid_error, *max(achieved))
 
 
 @dataclass(frozen=True)

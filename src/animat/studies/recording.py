@@ -9,6 +9,7 @@ from pathlib import Path
 from animat.cultures.series import SELECTION_FILE, STATE_FILE, record_series
 from animat.cultures.virtual import VirtualCulture
 from animat.errors import InvalidFile, UnusableData
+from animat.evaluation.transfer import no_memory
 from animat.execution.receipts import Receipt
 from animat.neurons.fidelity import Fidelity
 from animat.neurons.timeline import SimulatorTimeline, fit_timeline, save_timeline
@@ -80,7 +81,14 @@ class Fit(StudyTask):
     def make(self, folder: Path, progress: Progress) -> list[Path]:
         study, series = self.study, read_series(self.study, folder)
         timeline = fit_simulators(study, series)
-        timeline = replace(timeline, findings=(*timeline.findings, *_moved(study, timeline.start_min.tolist())))
+        timeline = replace(
+            timeline,
+            findings=(
+                *timeline.findings,
+                *_moved(study, timeline.start_min.tolist()),
+                *_no_memory(timeline),
+            ),
+        )
         return [save_timeline(timeline, folder / TIMELINE), _write_responses(folder / RESPONSES, series)]
 
 
@@ -114,6 +122,18 @@ def _write_responses(path: Path, series: list[Responses]) -> Path:
     )
     head = ("start_min", "condition", "rate_hz", "active_ratio", "is_burst")
     return write_table(path, [*head, *(f"rate_hz of {name}" for name in names)], rows)
+
+
+def _no_memory(timeline: SimulatorTimeline) -> Iterator[Finding]:
+    """A warning if the simulators, of the study's kind, lack the memory that the recordings show.
+
+    Recordings in blocks, as the paper's, cannot be simulated with memory.
+    """
+    presentation = timeline.presentation
+    if presentation is None or presentation.order != "blocked":
+        has_memory = timeline.fitted["kind"] == "memory"
+        for finding in no_memory(timeline.findings, presentation, has_memory=has_memory):
+            yield replace(finding, message=finding.message.replace("--simulator memory", 'simulators.kind = "memory"'))
 
 
 def _moved(study: Study, start_min: list[float]) -> Iterator[Finding]:
