@@ -26,6 +26,8 @@ from animat.studies.toml import study_to_toml
 SPECIFICATION = "study.toml"
 ITERATIONS_PER_S = 110_000
 """Training speed on one core, all policies of a group together; used only to order jobs and estimate the time left."""
+_S_PER_MIN = 0.75
+"""How long a minute of a virtual culture takes to compute."""
 _ABOUT_FILES = "# files: relative to the original specification. To run it from here: files = ['recordings']\n"
 
 
@@ -97,9 +99,11 @@ def plan_study(study: Study, base: Path) -> list[Job]:
     jobs: list[Job] = []
     neurons: tuple[str, ...] = ()
     if study.needs_neurons:
-        sessions = study.culture.sessions
+        culture = study.culture
+        # The time between recordings is computed too.
+        recorded_s = culture.sessions * (_S_PER_MIN * culture.interval_min if culture.kind == "virtual" else 0.3)
         jobs += [
-            Job(JOB, Record(study, base), (), 2 + (2.5 if study.culture.kind == "virtual" else 0.3) * sessions),
+            Job(JOB, Record(study, base), (), 2 + recorded_s),
             Job("fit", Fit(study), (JOB,), 3),
             Job("pictures/culture", CulturePictures(study), (JOB, "fit"), 15),
         ]
