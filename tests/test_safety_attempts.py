@@ -34,6 +34,7 @@ from animat.cultures.limits import SIMULATED_LIMITS, Limits
 from animat.cultures.observed import Observed
 from animat.cultures.openable import Turns
 from animat.cultures.safety import Admitted, Guard
+from animat.cultures.virtual import VirtualCulture
 from animat.errors import DeviceFailed, InvalidArgument, UnsafeStimulus
 from animat.stimulation.array import MAXONE
 from animat.stimulation.pulse import BALANCED_PULSE, PUBLISHED_PULSE, Phase, Pulse
@@ -618,6 +619,19 @@ def test_a_guard_or_a_history_that_a_backend_puts_in_by_accident_is_not_asked() 
 
     with Mine() as culture, pytest.raises(UnsafeStimulus, match="amplitude"):
         culture.deliver([one(0.0, Pulse((Phase(100, amplitude_mv=-500), Phase(100, amplitude_mv=500))))], 0.1)
+
+
+@pytest.mark.parametrize("device", [CL1Culture, MaxOneCulture])
+def test_nobody_loosens_the_limits_of_a_device(device: type[Culture]) -> None:
+    looser = property(lambda self: replace(SIMULATED_LIMITS, amplitude=1e9))
+    beside = type("Beside", (), {"device_limits": looser})
+    for bases, names in (((device,), {"device_limits": looser}), ((beside, device), {})):
+        with pytest.raises(TypeError, match=rf"Mine\.device_limits: final in {device.__name__}"):
+            type("Mine", bases, names)
+    type("Mine", (device,), {})
+    for culture in (CL1Culture(), VirtualCulture(1)):
+        with pytest.raises(AttributeError):
+            culture.device_limits = replace(culture.device_limits, amplitude=1e9)  # type: ignore[misc]
 
 
 def test_limits_of_a_device_that_change_meanwhile_are_those_at_its_opening() -> None:

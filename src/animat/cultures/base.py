@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Int64
 
 from animat.cultures.failures import as_device_failure
+from animat.cultures.limits import Limits
 from animat.cultures.observed import Observed, Spikes, assemble, with_rests
 from animat.cultures.openable import Openable
 from animat.cultures.safety import SIMULATED_LIMITS, Admitted
@@ -65,6 +66,11 @@ class Culture(Openable):
         for name, member in own.items():
             if getattr_static(cls, name, None) is not member:
                 raise TypeError(f"{cls.__name__}.{name}: final in Culture; implement only what is abstract")
+        # A device's limits are for all of its kind; its users can set tighter ones.
+        for kind in cls.__mro__:
+            is_of_device = kind.__module__.startswith(f"{__package__}.devices.") and "device_limits" in vars(kind)
+            if is_of_device and getattr_static(cls, "device_limits") is not vars(kind)["device_limits"]:
+                raise TypeError(f"{cls.__name__}.device_limits: final in {kind.__name__}; for tighter ones: limits=")
 
     @property
     @abc.abstractmethod
@@ -292,7 +298,10 @@ class ComputedCulture(Culture):
     """A culture that a program computes: a delivery ends within its call; reopened, it continues where it was."""
 
     ends_within_s: ClassVar[float] = -1
-    device_limits = SIMULATED_LIMITS
+
+    @property
+    def device_limits(self) -> Limits:
+        return SIMULATED_LIMITS
 
     def _halt(self) -> None:
         """Do nothing: the guard refuses the next delivery."""

@@ -83,7 +83,6 @@ class CL1Culture(Culture):
     name: ClassVar[str] = "cl1"
     sampling_rate_hz = float(FRAMES_PER_S)
     stimulation_electrodes = SITES
-    device_limits = CL1_LIMITS
 
     def __init__(
         self,
@@ -130,6 +129,10 @@ class CL1Culture(Culture):
     @property
     def patterns(self) -> Int64[np.ndarray, "patterns size"]:
         return self._patterns
+
+    @property
+    def device_limits(self) -> Limits:
+        return CL1_LIMITS
 
     @property
     def device(self) -> Path:
