@@ -51,4 +51,4 @@ class TuneFile(JobOptions):
         print(f"{counted(len(tuned.trials), 'trial')} ({states}) in {time.monotonic() - began:.0f} s")
         figures = f"{self.out / HISTORY}{f', {self.out / IMPORTANCE}' if tuned.importance else ''}"
         print(f"best settings: {self.out / BEST}; figures: {figures}")
-        return {"folder": str(tuned.folder), "best_toml": str(self.out / BEST), **tuned.to_dict()}
+        return {"folder": str(tuned.folder), "best_toml": str(tuned.folder / BEST), **tuned.to_dict()}
