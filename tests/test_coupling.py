@@ -173,6 +173,22 @@ def test_the_gaps_interval_is_that_of_a_bootstrap() -> None:
     np.testing.assert_allclose([gap.low, gap.high], ends, atol=0.1 * np.ptp(ends))
 
 
+@pytest.mark.parametrize(("achieved", "low"), [(60.0, 0.0), (100.0, 0.0), (110.0, 10 / 180), (119.9, 20 / 190)])
+def test_the_gaps_interval_begins_where_the_optimum_is_what_was_achieved(achieved: float, low: float) -> None:
+    """Of a coupling that returns 100 and random stimuli at -70, where the value is 120, as with memory."""
+    of_coupling, at_random = np.tile([99.0, 101.0], 500), np.tile([-71.0, -69.0], 500)
+    for known, unknown in ((achieved, 0.0), (0.0, achieved)):
+        gap = context_gap(of_coupling, at_random, Optimum(120.0, 0.1, known, 0.0, unknown, 0.0, 1000, 1))
+        usual = context_gap(of_coupling, at_random, optimum_of(120.0, 0.1))
+        assert gap.gap is not None and usual.gap is not None
+        assert (gap.gap.value, gap.gap.high) == (usual.gap.value, usual.gap.high)
+        assert gap.gap.low == pytest.approx(low, abs=0.002)
+        assert gap.needs_context == (low > 0.05)
+    # Where the controller was not run, nothing else is known.
+    nan = float("nan")
+    assert context_gap(of_coupling, at_random, Optimum(120.0, 0.1, nan, nan, nan, nan, 0, 1)).gap == usual.gap
+
+
 def test_a_task_that_a_reflex_solves_has_no_score() -> None:
     returns = np.full(100, 118.0) + np.arange(100) % 2
     gap = context_gap(returns, returns - 200, optimum_of(120.0))

@@ -240,7 +240,11 @@ class ContextGap:
 def context_gap(
     coupling: Float64[np.ndarray, " episodes"], random: Float64[np.ndarray, " episodes"], optimum: Optimum
 ) -> ContextGap:
-    """The context gap of a task, from returns of the best coupling and of random stimuli in fresh episodes."""
+    """The context gap of a task, from returns of the best coupling and of random stimuli in fresh episodes.
+
+    If the optimal return is known only to lie between a value and what its controller achieves, as with memory, the gap
+    is that for the value, and its interval begins where the optimum is what was achieved, by a coupling or by it.
+    """
     means, errors = ([float(f(x)) for x in (coupling, random)] for f in (np.mean, standard_error))
     span, gap = optimum.value - means[1], None
     if span > 0 and np.isfinite(errors).all():
@@ -248,7 +252,12 @@ def context_gap(
         # Derivatives of the gap: by coupling -1, by random stimuli gap, by optimum 1 - gap, each divided by the span.
         parts = np.array([errors[0], value * errors[1], (1 - value) * optimum.grid_error / _Z])
         spread = float(_Z * np.linalg.norm(parts) / span)
-        gap = Interval(value, value - spread, value + spread)
+        low = value - spread
+        # An optimum that its controller does not reach may be as low as what is achieved.
+        if optimum.findings() and (achieved := optimum.achieved[0]) < optimum.value:
+            unused = max(achieved - means[0], 0.0)
+            low = min(low, unused / (unused + means[0] - means[1]) - spread if unused else 0.0)
+        gap = Interval(value, low, value + spread)
     return ContextGap(means[0], errors[0], gap)
 
 

@@ -86,11 +86,15 @@ class Optimum:
             text += f"; too few responses to count: {', '.join(self.left_out)}"
         return text
 
+    @property
+    def achieved(self) -> tuple[float, float]:
+        """The larger of its controller's returns, with its standard error; NaN if the controller was not run."""
+        known = self.monte_carlo, self.standard_error
+        return max(known, (self.without_clock, self.without_clock_standard_error))
+
     def findings(self) -> tuple[Finding, ...]:
         """A warning if the value and its controller's return differ by more than chance and the grid's error."""
-        known = self.monte_carlo, self.standard_error
-        unknown = self.without_clock, self.without_clock_standard_error
-        return bracket_findings(self.value, self.grid_error, *max(known, unknown))
+        return bracket_findings(self.value, self.grid_error, *self.achieved)
 
 
 def bracket_findings(value: float, grid_error: float, monte_carlo: float, error: float) -> tuple[Finding, ...]:
