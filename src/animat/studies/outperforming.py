@@ -62,8 +62,8 @@ def compare_with_reflex(
                 continue
             random = rows_where(controls, agent=RANDOM, at_min=at_min)["return"].to_numpy()
             runs = best.monte_carlo, best.standard_error, best.without_clock, best.without_clock_standard_error
-            known, its_error, unknown, error = (nan if each is None else each for each in runs)
-            optimum = Optimum(best.best_return, best.grid_error or 0.0, known, its_error, unknown, error, 0, 0)
+            timed, its_error, untimed, error = (nan if each is None else each for each in runs)
+            optimum = Optimum(best.best_return, best.grid_error or 0.0, timed, its_error, untimed, error, 0, 0)
             context = context_gap(coupled.to_numpy(), random, optimum)
             yield ReflexComparison(
                 spec.name,
