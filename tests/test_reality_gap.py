@@ -718,7 +718,7 @@ CURRENT = Pulse((Phase(160.0, amplitude_ua=-1.0), Phase(160.0, amplitude_ua=1.0)
 
 
 @pytest.mark.usefixtures("few_bootstraps")
-@pytest.mark.parametrize("case", ["recorded", "given", "unknown", "replay", "replay of current"])
+@pytest.mark.parametrize("case", ["recorded", "given", "unknown", "session", "replay", "replay of current"])
 def test_a_loop_delivers_what_its_recording_was_made_with(
     case: str, tmp_path: Path, recordings: list[Recording], series: list[Responses]
 ) -> None:
@@ -728,13 +728,14 @@ def test_a_loop_delivers_what_its_recording_was_made_with(
     calibration = Calibration.of_series([replace(each, recording=of) for each, of in zip(series, made, strict=True)])
     settings: dict[str, Any] = {"episodes": 1, "with_controls": False}
     settings |= {"pulse": PUBLISHED_PULSE, "patterns": 2} if case == "given" else {}
-    if case == "unknown":
-        calibration = replace(calibration, recording=replace(made[0], protocol=None))
+    if case in ("unknown", "session"):
+        looped = WEAK if case == "session" else None
+        calibration = replace(calibration, recording=replace(made[0], protocol=None, loop_pulse=looped))
     policies = {"p0": policy_of(0, series)}
     with ReplayCulture(recordings) if "replay" in case else FakeCulture() as culture:
         gap = run_policies(policies, culture, calibration, tmp_path / "s", **settings)
-        n = {"given": 2, "unknown": len(culture.patterns)}.get(case, 3)
-    assert gap.loop.pulse == (WEAK if case in ("recorded", "replay") else PUBLISHED_PULSE)
+        n = {"given": 2, "unknown": len(culture.patterns), "session": len(culture.patterns)}.get(case, 3)
+    assert gap.loop.pulse == (WEAK if case in ("recorded", "session", "replay") else PUBLISHED_PULSE)
     assert {pattern for tick in gap.session.ticks for pattern in tick.patterns} == {*range(n)}
     assert ("unknown-pulse" in {finding.name for finding in gap.findings}) == (case == "unknown")
 

@@ -22,14 +22,32 @@ from animat.closed_loop.agents import Agent, OneCondition
 from animat.closed_loop.log import LogWriter, Record, read_log
 from animat.closed_loop.running import run_session
 from animat.closed_loop.session import LOG_FILE, Session, read_session, recover_session
-from animat.errors import InvalidFile, UnusableData
+from animat.errors import InvalidArgument, InvalidFile, UnusableData
 from animat.recordings.formats.hdf5_formats import read_hdf5
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.formats.nwb_spikes import SpikeCounts
+from animat.recordings.reading import read_recording
 from animat.recordings.recording import Channels, Recording
+from animat.stimulation.protocol import Protocol
+from animat.stimulation.pulse import PUBLISHED_PULSE, Phase, Pulse
 from animat.stimulation.stimulus import Stimuli
 from fake_culture import FakeCulture
 from test_closed_loop import RANDOM, loop_of
+
+
+def test_the_recording_states_its_pulse(tmp_path: Path) -> None:
+    pulse = Pulse((Phase(400.0, amplitude_mv=-90.0), Phase(400.0, amplitude_mv=90.0)))
+    session = ran(tmp_path / "s", pulse=pulse)
+    read = read_recording(session.recording_file)
+    assert read.pulse == pulse == session.recording().pulse and read.protocol is None
+    write_nwb(read, tmp_path / "again.nwb")
+    assert read_recording(tmp_path / "again.nwb").equals(read)
+    # The protocol, where there is one, is what was delivered.
+    assert replace(read, protocol=Protocol(pulse=PUBLISHED_PULSE)).pulse == PUBLISHED_PULSE
+    assert replace(read, loop_pulse=None).pulse is None
+    wrong = replace(read, provenance={**read.provenance, "closed_loop_pulse": "[]"})
+    with pytest.raises(InvalidArgument, match="closed_loop_pulse"):
+        write_nwb(wrong, tmp_path / "wrong.nwb")
 
 
 def ran(folder: Path, **changed: Any) -> Session:

@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from animat.reality_gap import Calibration, RealityGap
     from animat.recordings.recording import Recording
     from animat.responses.conditions import Conditions
-    from animat.stimulation.protocol import Protocol
     from animat.stimulation.pulse import Pulse
     from animat.training.policy import Policy
 
@@ -98,12 +97,12 @@ class Run(StimulationOptions):
         recordings = read_recordings(self.recordings)
         calibration = self._calibration(recordings, first, fit)
         calibrating = next(recording for recording in recordings if recording.start_min == calibration.start_min)
-        protocol, unknown = self._protocol(recordings, calibrating)
+        pulse, patterns, unknown = self._delivered(recordings, calibrating)
         loop, _ = Loop.of_policy(
             first,
             calibration.percentiles,
             conditions=calibration.conditions,
-            pulse=protocol.pulse,
+            pulse=pulse,
             adaptive_from=calibration.adjusted if calibration.adaptive else None,
             **settings,
         )
@@ -134,7 +133,7 @@ class Run(StimulationOptions):
                     noticed=unknown,
                     pulse=loop.pulse,
                     # All, if the recordings do not state how many they used.
-                    patterns=None if unknown else min(protocol.patterns, len(culture.patterns)),
+                    patterns=None if patterns is None else min(patterns, len(culture.patterns)),
                     **settings,
                 )
                 # Reported even if closing the culture fails.
@@ -189,33 +188,41 @@ class Run(StimulationOptions):
             print(f"recording: {gap.session.recording_file}; every tick: {self.out / 'session.log'}")
         expect_no_fault(gap.session, self.out)
 
-    def _protocol(self, recordings: Sequence[Recording], calibrating: Recording) -> tuple[Protocol, list[Finding]]:
-        """The protocol of the calibrating recording, else of --protocol, else the usual one, with a warning."""
+    def _delivered(
+        self, recordings: Sequence[Recording], calibrating: Recording
+    ) -> tuple[Pulse, int | None, list[Finding]]:
+        """The pulse and the number of patterns of the calibrating recording, else of --protocol.
+
+        If neither states a pulse, it is the usual one, with a warning; no number: it is not known.
+        """
         from animat.cultures.kinds import pulse_for
         from animat.stimulation.protocol import CLOSED_LOOP, read_protocol
 
-        usual = replace(CLOSED_LOOP, pulse=pulse_for(self.culture))
-        option = None if self.protocol is None else read_protocol(self.protocol, usual)
-        stated = [(f"at {in_min(recording.start_min)}", recording.protocol) for recording in recordings]
-        stated.append((str(self.protocol), option))
-        pulses = {protocol.pulse: where for where, protocol in stated if protocol is not None}
+        usual = pulse_for(self.culture)
+        option = None if self.protocol is None else read_protocol(self.protocol, replace(CLOSED_LOOP, pulse=usual))
+        given = None if option is None else option.pulse
+        stated = [(f"at {in_min(recording.start_min)}", recording.pulse) for recording in recordings]
+        stated.append((str(self.protocol), given))
+        pulses = {pulse: where for where, pulse in stated if pulse is not None}
         if len(pulses) > 1:
             (one, where), (other, elsewhere), *_ = pulses.items()
             raise Mismatch(
                 f"--recordings: expected one pulse in all, got {one} ({where}) and {other} ({elsewhere}): give those "
                 "that were recorded with the pulse that the loop is to deliver"
             )
-        if (protocol := calibrating.protocol or option) is not None:
+        protocol = calibrating.protocol or option
+        patterns = None if protocol is None else protocol.patterns
+        if (pulse := calibrating.pulse or given) is not None:
             # A replay responds alike to every pulse, and its limits are those of voltages.
-            is_delivered = self.culture != "replay" or protocol.pulse.kind == usual.pulse.kind
-            return (protocol if is_delivered else replace(protocol, pulse=usual.pulse)), []
-        pulse = next(iter(pulses), usual.pulse)
+            is_delivered = self.culture != "replay" or pulse.kind == usual.kind
+            return pulse if is_delivered else usual, patterns, []
+        pulse = next(iter(pulses), usual)
         source = "as in the other recordings" if pulses else f"the usual one with --culture {self.culture}"
         message = (
             f"the recording at {in_min(calibrating.start_min)}, which calibrates the loop, does not state its pulse: "
             f"the loop delivers {pulse}, {source}; to change it, use --protocol"
         )
-        return replace(usual, pulse=pulse), [Finding("unknown-pulse", "warning", message)]
+        return pulse, patterns, [Finding("unknown-pulse", "warning", message)]
 
     def _culture(
         self, recordings: Sequence[Recording], calibrating: Recording, pulse: Pulse, progress: Progress

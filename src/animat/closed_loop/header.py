@@ -20,6 +20,7 @@ from animat.responses.readouts import Readouts
 from animat.robots.base import Robot
 from animat.robots.registry import robot_from_dict
 from animat.stimulation.protocol import Presentation
+from animat.stimulation.pulse import Pulse
 
 FORMAT = "animat closed-loop session 1"
 
@@ -80,6 +81,7 @@ class Header:
         observed: the columns of the robot's observation, with their units.
         loop: all settings, as JSON.
         readouts: names of the groups of channels that were read; none where all channels were read as one.
+        pulse: that was delivered.
     """
 
     channels: Channels
@@ -93,6 +95,7 @@ class Header:
     observed: tuple[str, ...]
     loop: str
     readouts: tuple[str, ...] = ()
+    pulse: Pulse | None = None
 
 
 def observed_columns(robot: Robot[Any]) -> list[str]:
@@ -124,6 +127,7 @@ def read_header(file: Path, fields: Mapping[str, Any]) -> Header:
             observed=tuple(observed),
             loop=json.dumps(loop),
             readouts=() if readouts.are_all else readouts.names,
+            pulse=Pulse.from_list(loop["pulse"]) if "pulse" in loop else None,
         )
     except (AnimatError, OverflowError, TypeError) as error:
         raise InvalidFile(f"{file}: the header of the session: {error}") from error

@@ -99,7 +99,7 @@ class SessionData:
             duration_s=duration_s,
             start_min=header.start_min,
             presentation=header.presentation,
-            **from_metadata(metadata),
+            **from_metadata(metadata) | {"loop_pulse": header.pulse},
         )
 
     def _stimuli(self) -> Stimuli:

@@ -243,12 +243,13 @@ def _as_recorded(
 
     A replay responds alike to every pulse, and its limits are those of voltages.
     """
-    protocol = None if calibration.recording is None else calibration.recording.protocol
-    if protocol is not None:
-        own: dict[str, Any] = {"patterns": min(protocol.patterns, len(culture.patterns))}
-        if not isinstance(culture, ReplayCulture) or protocol.pulse.kind == PUBLISHED_PULSE.kind:
-            own["pulse"] = protocol.pulse
-        return own | settings, ()
+    own, recording = dict[str, Any](), calibration.recording
+    if recording is not None and recording.protocol is not None:
+        own["patterns"] = min(recording.protocol.patterns, len(culture.patterns))
+    if recording is not None and (pulse := recording.pulse) is not None:
+        is_delivered = not isinstance(culture, ReplayCulture) or pulse.kind == PUBLISHED_PULSE.kind
+        own["pulse"] = pulse if is_delivered else PUBLISHED_PULSE
+    settings = own | settings
     if "pulse" in settings:
         return settings, ()
     message = (

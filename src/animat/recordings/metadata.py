@@ -14,20 +14,24 @@ from animat.recordings.recorded_culture import RecordedCulture, names_in
 from animat.recordings.recording import Recording
 from animat.records import json_data, read_record
 from animat.stimulation.protocol import Protocol
+from animat.stimulation.pulse import Pulse
 
 _VALUES = "values of findings"
 """The key of the findings' values, as JSON by the keys of their messages."""
+_LOOP_PULSE = "closed_loop_pulse"
 
 
 def to_metadata(recording: Recording) -> dict[str, str]:
     """The provenance, and the fields that `from_metadata` restores; refuses what would be read back as another."""
     metadata = dict(recording.provenance)
-    if reserved := [key for key in metadata if key in ("protocol", _VALUES) or _is_finding(key)]:
+    if reserved := [key for key in metadata if key in ("protocol", _VALUES, _LOOP_PULSE) or _is_finding(key)]:
         raise InvalidArgument(f"provenance: expected no key of a file's protocol or findings, got {reserved[0]!r}")
     if _nameless(culture := culture_of(metadata)) != _nameless(recording.culture):
         raise InvalidArgument(f"culture: expected {culture!r} by the provenance's source, got {recording.culture!r}")
     if recording.protocol is not None:
         metadata["protocol"] = recording.protocol.to_json()
+    if recording.loop_pulse is not None:
+        metadata[_LOOP_PULSE] = json.dumps(recording.loop_pulse.to_list())
     findings = {f"{finding.severity}: {finding.name}": finding for finding in recording.findings}
     if values := {key: finding.value for key, finding in findings.items() if finding.value is not None}:
         metadata[_VALUES] = json.dumps(values)
@@ -36,18 +40,21 @@ def to_metadata(recording: Recording) -> dict[str, str]:
 
 def from_metadata(metadata: Mapping[str, str]) -> dict[str, Any]:
     """Fields of a recording, from its `provenance` to its date; refuses what is no protocol or no number."""
-    provenance, findings, protocol = dict[str, str](), list[Finding](), None
+    provenance, findings, protocol, pulse = dict[str, str](), list[Finding](), None, None
     values = read_record(dict[str, float], json_data(metadata.get(_VALUES, "{}"), _VALUES), _VALUES)
     for key, text in metadata.items():
         if key == "protocol":
             protocol = Protocol.from_json(text)
+        elif key == _LOOP_PULSE:
+            pulse = Pulse.from_list(json_data(text, _LOOP_PULSE))
         elif _is_finding(key):
             severity, _, name = key.partition(": ")
             findings.append(Finding(name, severity, text, values.get(key)))  # type: ignore[arg-type]
         elif key != _VALUES:
             provenance[key] = text
     origin = {"culture": culture_of(metadata), "recorded_at": date_of(metadata)}
-    return {"provenance": provenance, "protocol": protocol, "findings": tuple(findings), **origin}
+    delivered = {"protocol": protocol, "loop_pulse": pulse}
+    return {"provenance": provenance, **delivered, "findings": tuple(findings), **origin}
 
 
 def _nameless(culture: RecordedCulture | None) -> RecordedCulture | None:

@@ -17,6 +17,7 @@ from animat.recordings.findings import Finding
 from animat.recordings.recorded_culture import RecordedCulture
 from animat.stimulation.array import ElectrodeArray
 from animat.stimulation.protocol import Presentation, Protocol
+from animat.stimulation.pulse import Pulse
 from animat.stimulation.stimulus import Stimuli
 from animat.tables import CENTURY_S, FASTEST_HZ, briefly, expect_rising_times, freeze, read_only, reduce_dataclass
 
@@ -88,6 +89,7 @@ class Recording:
         culture: that was recorded, None if not known.
         findings: made when the recording was read or its spikes were detected.
         recorded_at: when it began, with a time zone; None if not known.
+        loop_pulse: that a closed loop delivered, if this is the recording of one; else None.
 
     Raises:
         UnusableData: for times that are not finite or not in ascending order, or rows outside the tables.
@@ -109,6 +111,7 @@ class Recording:
     culture: RecordedCulture | None = None
     findings: tuple[Finding, ...] = ()
     recorded_at: datetime | None = None
+    loop_pulse: Pulse | None = None
 
     def __post_init__(self) -> None:
         freeze(self, "spikes", spike_times_s=np.float64, spike_channels=np.int64)
@@ -143,6 +146,11 @@ class Recording:
     def stop_s(self) -> float:
         """End of the recording on its own clock, in seconds."""
         return self.start_s + self.duration_s
+
+    @property
+    def pulse(self) -> Pulse | None:
+        """The pulse that was delivered; None if it is not known."""
+        return self.loop_pulse if self.protocol is None else self.protocol.pulse
 
     def without_spikes(self) -> Recording:
         """The same without its spikes, which take by far the most room."""
