@@ -786,6 +786,11 @@ def test_a_study_written_as_toml_is_read_as_the_same(study: Study, tmp_path: Pat
     assert read_study(tmp_path / "study.toml") == study
 
 
+def test_what_is_written_of_given_recordings_is_what_is_known_of_them() -> None:
+    written = study_to_toml(read_study(TINY)).partition("[culture]")[2].partition("[[")[0].split()
+    assert [word for word in written if word in ("files", "order", "sessions", "trials", "seed")] == ["files"]
+
+
 def test_the_paper_is_kept_to() -> None:
     study = paper_study()
     assert (study.policies, study.culture.sessions, study.culture.interval_min) == (10, 15, 10.0)

@@ -83,8 +83,14 @@ def _rename_keys(table: Any, names: dict[str, str]) -> Any:
 
 
 def study_to_toml(study: Study) -> str:
-    """The study as TOML with every setting; `read_study` returns the same study."""
-    return "\n".join(_lines(dataclasses.asdict(study), ())) + "\n"
+    """The study as TOML with every setting; `read_study` returns the same study.
+
+    How a culture is recorded is left out where its recordings are given.
+    """
+    settings = dataclasses.asdict(study)
+    if study.culture.kind == "files":
+        settings["culture"] = {key: settings["culture"][key] for key in ("kind", "files", "folders")}
+    return "\n".join(_lines(settings, ())) + "\n"
 
 
 def _lines(table: dict[str, Any], path: tuple[str, ...]) -> list[str]:
