@@ -237,6 +237,8 @@ def test_recordings_on_disk_are_the_neurons(tmp_path) -> None:
         ({"at_min": 140, "simulator": synthetic_simulator()}, "at_min: expected only with recordings"),
         ({"window_ms": (2.0, 8.0)}, "window_ms: expected only with recordings"),
         ({"kind": "empirical"}, "kind: expected only with recordings"),
+        ({"maping": "linear"}, "got 'maping'; did you mean mapping\\?$"),
+        ({"goals": "reach"}, "got 'goals'; did you mean goal\\?$"),
         ({"name": 3.0}, "cartpole: expected parameters among .*, got 'name'"),
         ({"simulator": "memory"}, "simulator: expected a simulator; `kind` takes the name of one, got 'memory'"),
         ({"recordings": 3}, "recordings: expected a path or several, got 3"),

@@ -6,6 +6,7 @@ import os
 import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass
+from inspect import signature
 from numbers import Real
 from typing import Any
 
@@ -16,7 +17,7 @@ from animat.coding.checking import check_mapping
 from animat.coding.decoder import expect_fit
 from animat.coding.mapping import Mapping, mapping_named
 from animat.environment import Animat, Environment
-from animat.errors import InvalidArgument, expect_kind, expect_several
+from animat.errors import InvalidArgument, did_you_mean, expect_kind, expect_several
 from animat.goals.goal import Goal
 from animat.goals.robot import with_goal
 from animat.neurons.simulator import NeuronSimulator
@@ -105,7 +106,12 @@ def set_up(
         raise InvalidArgument(
             "robot: expected a name, as in gymnasium.make('Animat/Robot-v0', robot='shuttle'), got none"
         )
-    body = robot_named(robot, **parameters)
+    try:
+        body = robot_named(robot, **parameters)
+    except InvalidArgument as error:
+        # A misspelt option is taken for a parameter of the robot.
+        hints = (did_you_mean(name, signature(set_up).parameters) for name in parameters)
+        raise InvalidArgument(f"{error}{next(filter(None, hints), '')}") from None
     if isinstance(body, HostRobot):
         raise InvalidArgument(
             f"robot: expected one stepped in JAX, got {body.name}, which Gymnasium steps: use it with animat train"
