@@ -21,8 +21,9 @@ class Caption(NamedTuple):
 HEADLINE = (
     "Each row is an arm, described in the table below, at the last recording that it was evaluated on; further right "
     "is better. Small dots: each policy's mean return. Large dot: their interquartile mean (the mean of the middle "
-    "half), with its 95 % interval; an arrow means that the interval extends beyond the axis. Crosses: random actions. "
-    "Bars: the optimal return, which no controller can exceed, where it is known. {policies} per arm."
+    "half), with its 95 % interval, which is wide for few policies: that of four rests on two. An arrow means that it "
+    "extends beyond the axis. Crosses: random actions. Bars: the optimal return, where it is known; no controller can "
+    "exceed it by more than its error, given with the scores. {policies} per arm."
 )
 
 CULTURE = {
