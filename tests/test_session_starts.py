@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from animat.closed_loop.runner import runner_of
+from animat.closed_loop.runner import runner_of, starts_of
 from animat.coding.mapping import Thresholds
 from animat.environment import Animat, WithoutNeurons
 from animat.evaluation.optimum import optimal_values
@@ -69,16 +69,16 @@ def test_bodies_outside_jax_start_where_those_of_a_session_will(episodes: int) -
     environment = WithoutNeurons(robot, (-1.0, 1.0))
     returns = roll_out(environment, None, Uniform(), episodes=episodes, seed=1, starts=starts).returns
     np.testing.assert_allclose(returns[0], -4 * np.abs(loop[np.arange(episodes) % 3]), rtol=1e-5)
-    assert starts.differ(robot)
+    assert starts_of(robot, 5, 3) == starts
 
 
 def test_it_is_known_whether_starts_differ() -> None:
     """Also where a session has only one round: then its start is still one of many."""
     for robot in (Cartpole(), Navigation(), SwingUp()):
-        assert not Starts.of_session(1, 5).differ(robot)
+        assert starts_of(robot, 1, 5) is None
     for robot in (Shuttle(), Wheels(), Drawn()):
-        assert Starts.of_session(1, 5).differ(robot) and Starts.of_session(1, 1).differ(robot)
-    assert Starts.of_session(1, 5) != Starts.of_session(2, 5)
+        assert starts_of(robot, 1, 5) == Starts.of_session(1, 5) != Starts.of_session(2, 5)
+        assert starts_of(robot, 1, 1) == Starts.of_session(1, 1)
 
 
 def test_without_different_starts_returns_are_the_same_to_the_bit() -> None:

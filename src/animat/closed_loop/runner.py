@@ -14,7 +14,11 @@ from animat.errors import InvalidArgument
 from animat.lazy import jax, jnp
 from animat.robots.base import Robot, capability
 from animat.robots.host import Bodies, HostRobot
+from animat.robots.starts import Starts, robot_generator
 from animat.wrappers import other_goal
+
+_FEWEST_STARTS = 10
+"""Fewest starts that show whether a robot always starts alike."""
 
 
 class Moved(NamedTuple):
@@ -111,6 +115,13 @@ class HostRunner:
     def picture(self) -> UInt8[np.ndarray, "height width 3"] | None:
         """A picture of the robot now; None if it draws none."""
         return self._bodies.picture()
+
+
+def starts_of(robot: Robot[Any], seed: int, rounds: int) -> Starts | None:
+    """The starts of a session's rounds; None if all are alike, and would be in further rounds too."""
+    runner = runner_of(robot, robot_generator(seed))
+    seen = [runner.reset(number) for number in range(max(rounds, _FEWEST_STARTS))]
+    return Starts.of_session(seed, rounds) if np.any(np.ptp(seen, axis=0) > 0) else None
 
 
 def runner_of(robot: Robot[Any], rng: np.random.Generator) -> RobotRunner | HostRunner:

@@ -14,6 +14,7 @@ import numpy as np
 from animat.arguments import checked_arguments
 from animat.closed_loop.agents import Agent, Greedy, agent_of
 from animat.closed_loop.loop import Loop
+from animat.closed_loop.runner import starts_of
 from animat.closed_loop.running import check_session, run_session
 from animat.closed_loop.session import Session
 from animat.coding.encoder import electrode_pulses
@@ -296,9 +297,8 @@ def _warnings(first: Policy, loop: Loop, calibration: Calibration, age_min: floa
 
 def _starts(robot: Robot[Any], seed: int, episodes: int) -> Starts | None:
     """The starts of a session's rounds; None if all are alike, or too many to predict from each of them."""
-    starts = Starts.of_session(seed, episodes)
     most = episodes_on_host(robot) if isinstance(robot, HostRobot) else EPISODES
-    return starts if 1 <= episodes <= most and starts.differ(robot) else None
+    return starts_of(robot, seed, episodes) if 1 <= episodes <= most else None
 
 
 def planned_episodes(policies: int, controls: int, episodes: int) -> list[int]:

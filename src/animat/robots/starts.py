@@ -4,17 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 from jaxtyping import Array, Key
 
 from animat.lazy import jax, jnp
-from animat.robots.base import Robot
-from animat.robots.host import Bodies, HostRobot
-
-_FEWEST = 10
-"""Fewest starts that show whether a robot always starts alike."""
 
 
 @dataclass(frozen=True)
@@ -40,16 +35,6 @@ class Starts:
     def seeds_of(self, episodes: Sequence[int]) -> list[tuple[int, int]]:
         """The seeds of bodies outside JAX in these episodes, by their numbers."""
         return [(self.entropy, episode % self.rounds) for episode in episodes]
-
-    def differ(self, robot: Robot[Any]) -> bool:
-        """Whether the robot is seen to start differently in different rounds; also asked of rounds that do not come."""
-        several = Starts(self.entropy, max(self.rounds, _FEWEST))
-        seen: Any
-        if isinstance(robot, HostRobot):
-            seen = Bodies(robot, several.seeds_of(range(several.rounds))).begin()
-        else:
-            seen = jax.vmap(lambda key: robot.observe(robot.reset(key)))(several.of_episodes(several.rounds))
-        return bool(np.any(np.ptp(np.asarray(seen), axis=0) > 0))
 
 
 def robot_generator(seed: int) -> np.random.Generator:
