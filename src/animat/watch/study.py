@@ -109,7 +109,7 @@ def _results_table(folder: Path, width: Width) -> dict[str, Any]:
                 rows += _results_of(path)
             except Exception:  # anything may be in a file
                 left_out.append(path.relative_to(folder).as_posix())
-    note = "Over all policies, on the last recording; the report has comparisons." if rows else "None yet."
+    note = "Over all policies, on the last recording; comparisons are in report.html in the folder, once it is done." if rows else "None yet."
     if left_out:
         note += f" Left out, as they cannot be read: {some_of(left_out)}."
     return table("Results", ["robot", "arm", "mean return", "policies", "episodes"], rows, note, width=width)
