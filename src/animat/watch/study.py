@@ -109,7 +109,9 @@ def _results_table(folder: Path, width: Width) -> dict[str, Any]:
                 rows += _results_of(path)
             except Exception:  # anything may be in a file
                 left_out.append(path.relative_to(folder).as_posix())
-    note = "Over all policies, on the last recording; comparisons are in report.html in the folder, once it is done." if rows else "None yet."
+    note = "None yet."
+    if rows:
+        note = "Over all policies, on the last recording; comparisons are in the folder's report.html once it is done."
     if left_out:
         note += f" Left out, as they cannot be read: {some_of(left_out)}."
     return table("Results", ["robot", "arm", "mean return", "policies", "episodes"], rows, note, width=width)
