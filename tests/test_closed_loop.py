@@ -608,7 +608,7 @@ def test_a_loop_presents_as_the_policy_was_recorded_and_names_where_it_does_not(
         # A quarter of an hour at the slowest of 5 to 80 Hz.
         (
             {"pulses": 5001},
-            r"pulses: expected trials of 1000 s at most, got 5001 .* take 1,000 s at 5 Hz: use fewer",
+            r"pulses: expected trials of 1000 s at most, got 5001 .* take 1,000\.2 s at 5 Hz: use at most 5,000",
         ),
         ({"window_ms": (10.0, 2.0)}, "start < end"),
         ({"conditions": ()}, "at least one"),

@@ -53,7 +53,8 @@ class Encoder:
                 raise UnusableData(f"{expected} electrodes of its pulses, as a closed loop needs, got none; {remedy}")
         slowest_hz = min(min(condition.frequencies_hz) for condition in self.conditions)
         if self.pulses > slowest_hz / SLOWEST_HZ:
-            take = f"which take {self.pulses / slowest_hz:,.0f} s at {slowest_hz:g} Hz: use fewer"
+            most = int(slowest_hz / SLOWEST_HZ)
+            take = f"which take {self.pulses / slowest_hz:,g} s at {slowest_hz:g} Hz: use at most {most:,}"
             expected = f"expected trials of {1 / SLOWEST_HZ:g} s at most"
             raise InvalidArgument(f"pulses: {expected}, got {shown(self.pulses)} pulses per trial, {take}")
 
