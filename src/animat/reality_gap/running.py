@@ -246,7 +246,7 @@ def _as_recorded(
     """
     own, recording = dict[str, Any](), calibration.recording
     if recording is not None and recording.protocol is not None:
-        own["patterns"] = min(recording.protocol.patterns, len(culture.patterns))
+        own["patterns"] = min(recording.protocol.patterns, len(culture.patterns)) or None
     if recording is not None and (pulse := recording.pulse) is not None:
         is_delivered = not isinstance(culture, ReplayCulture) or pulse.kind == PUBLISHED_PULSE.kind
         own["pulse"] = pulse if is_delivered else PUBLISHED_PULSE
