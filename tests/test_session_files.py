@@ -22,7 +22,9 @@ from animat.closed_loop.agents import Agent, OneCondition
 from animat.closed_loop.log import LogWriter, Record, read_log
 from animat.closed_loop.running import run_session
 from animat.closed_loop.session import LOG_FILE, Session, read_session, recover_session
+from animat.cultures.budget import Account, Budget
 from animat.errors import InvalidArgument, InvalidFile, UnusableData
+from animat.evaluation.statistics import Interval
 from animat.recordings.formats.hdf5_formats import read_hdf5
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.formats.nwb_spikes import SpikeCounts
@@ -48,6 +50,27 @@ def test_the_recording_states_its_pulse(tmp_path: Path) -> None:
     wrong = replace(read, provenance={**read.provenance, "closed_loop_pulse": "[]"})
     with pytest.raises(InvalidArgument, match="closed_loop_pulse"):
         write_nwb(wrong, tmp_path / "wrong.nwb")
+
+
+def test_what_was_predicted_and_measured_is_recovered(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    predicted = {"random": Interval(-1.25, -2.0, 3.0)}
+    with FakeCulture(3) as culture:
+        agents, loop = [RANDOM, Agent("silent", "", OneCondition(0), "silent")], loop_of()
+        account = Account(Budget(pulses=152))
+        session = run_session(culture, loop, agents, tmp_path / "s", episodes=30, account=account, predicted=predicted)
+    session.recording_file.unlink()
+    assert main(["recover", str(tmp_path / "s"), "--json"]) == 0
+    *_, head, random, silent, line = capsys.readouterr().out.splitlines()
+    whole = {
+        name: [e.total for e in session.episodes if e.agent == name and e.is_whole] for name in ("random", "silent")
+    }
+    summary = json.loads(line)
+    assert summary["whole_episodes"] == sum(map(len, whole.values())) < summary["episodes"]
+    mean = f"{np.mean(whole['random']):.1f}"
+    assert random.split() == ["random", "-1.2", "-2.0", "to", "3.0", mean, str(len(whole["random"]))]
+    assert silent.split() == ["silent", "-", f"{np.mean(whole['silent']):.1f}", str(len(whole["silent"]))]
+    assert head.split()[0] == "predicted" and [each["name"] for each in summary["agents"]] == ["random", "silent"]
+    assert [each["mean"] for each in summary["agents"]] == pytest.approx([np.mean(of) for of in whole.values()])
 
 
 def ran(folder: Path, **changed: Any) -> Session:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 from tyro.conf import Positional
 
 from animat.cli.command import Command
+from animat.columns import align_columns
 
 
 @dataclass(frozen=True)
@@ -21,6 +23,7 @@ class Recover(Command):
     def run(self) -> dict[str, Any]:
         from animat.closed_loop.session import lost_message, recover_session, unanswered_message
         from animat.progress import Bar
+        from animat.watch.tail import by_agent
 
         with Bar("reading the log") as progress:
             session = recover_session(self.session, progress)
@@ -29,8 +32,20 @@ class Recover(Command):
             f"{session.recording_file} and {session.ticks_file.name}: {summary['ticks']} ticks, "
             f"{summary['pulses']} pulses; it ended: {summary['ended']}"
         )
+        header = session.log.header
+        names = [agent["name"] for agent in header["agents"]]
+        agents = by_agent(names, session.episodes, header.get("predicted"))
+        if rows := [_cells(**agent) for agent in agents]:
+            head = ["", "predicted", "its 95 % interval", "measured", "whole episodes"]
+            print("\n".join(align_columns(head, rows)))
         if summary["unanswered_pulses"]:
             print(unanswered_message(session))
         if summary["lost_bytes"]:
             print(lost_message(summary["lost_bytes"]))
-        return {"recording": str(session.recording_file), **summary}
+        return {"recording": str(session.recording_file), **summary, "agents": agents}
+
+
+def _cells(name: str, n: int, mean: float | None, predicted: Sequence[float] | None, **_: Any) -> list[str]:
+    """A row of the table: mean returns of an agent, as far as they are known."""
+    value, *ends = ("-", "") if predicted is None else (f"{predicted[0]:.1f}", "{1:.1f} to {2:.1f}".format(*predicted))
+    return [name, value, *ends, "-" if mean is None else f"{mean:.1f}", str(n)]
