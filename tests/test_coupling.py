@@ -184,6 +184,11 @@ def test_the_gaps_interval_begins_where_the_optimum_is_what_was_achieved(achieve
         assert (gap.gap.value, gap.gap.high) == (usual.gap.value, usual.gap.high)
         assert gap.gap.low == pytest.approx(low, abs=0.002)
         assert gap.needs_context == (low > 0.05)
+    # What was achieved has an error too, and may be no more than random stimuli.
+    unsure = context_gap(of_coupling, at_random, Optimum(120.0, 0.1, achieved, 3.0, 0.0, 0.0, 100, 1)).gap
+    assert unsure is not None and (unsure.low < gap.gap.low - 0.01 or low in (0.0, 20 / 190))
+    worse = context_gap(at_random - 5, at_random, Optimum(120.0, 0.1, -70.0, 1.0, -80.0, 1.0, 100, 1)).gap
+    assert worse is not None and worse.low == 0.0
     # Where the controller was not run, nothing else is known.
     nan = float("nan")
     assert context_gap(of_coupling, at_random, Optimum(120.0, 0.1, nan, nan, nan, nan, 0, 1)).gap == usual.gap

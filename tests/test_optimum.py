@@ -255,6 +255,7 @@ def test_a_value_that_its_controller_does_not_reach_is_reported() -> None:
     optimum = Optimum(100.0, 0.5, 90.0, 0.5, 99.0, 0.5, 100, 1000)
     assert not optimum.findings() and replace(optimum, without_clock=97.0).findings()[0].value == 3.0
     assert not replace(optimum, monte_carlo=99.0, without_clock=90.0).findings()
+    assert replace(optimum, monte_carlo=math.nan).achieved == (99.0, 0.5) == optimum.achieved
     row = StudyOptimum("cartpole", "linear", "first", 0.0, 100.0, None, None, 0.5, 90.0, 0.5, 99.0, 0.5, 1000, None)
     assert row.findings() == () and replace(row, without_clock=97.0).findings() == (
         replace(optimum, without_clock=97.0).findings()

@@ -824,6 +824,50 @@ def test_an_ended_session_is_compared_with_the_starts_that_it_had(tmp_path: Path
     assert one.rows[0].turn is not None and one.rows[0].turn.tolist() == [0] and one.rows[0].gap.high == np.inf
 
 
+def test_a_loss_is_between_the_same_starts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where a control has had five rounds of twenty, and nothing is lost: starts differ by more than all else."""
+    monkeypatch.setattr("animat.reality_gap.row._RESAMPLES", 1_000)
+    rng, covered = np.random.default_rng(9), 0
+    row = Row("p", "", np.zeros(9), np.zeros(9), np.zeros(0), 1.0, 1.0, None, 0.0, 0.0, 0.0)
+    ideal = Control("ideal actuator", "", Uniform())
+    for _ in range(100):
+        from_start = rng.normal(0.0, 30.0, 20)
+
+        def of(name: str, rounds: int, from_start: np.ndarray = from_start) -> Row:
+            turn, expected = np.arange(rounds), from_start[:rounds]
+            predicted = (expected[:, None] + rng.normal(0.0, 10.0, (rounds, 50))).ravel()
+            measured = expected + rng.normal(0.0, 10.0, rounds)
+            known = {"turn": turn, "expected": expected, "from_all_starts": float(from_start.mean())}
+            return replace(row, name=name, predicted=predicted, measured=measured, **known)
+
+        rows = of("policies", 20), of("silent", 5), of("random", 5)
+        *_, lost = intervention_table(rows, ideal, from_start)
+        covered += lost.lost.low <= 0 <= lost.lost.high
+        assert abs(lost.lost.value) < 25
+    # At least 95 of 100, standard deviation 2.2.
+    assert covered >= 89
+
+
+def test_rounding_is_no_gap() -> None:
+    row = Row("p", "", np.full(9, 100.0), np.full(9, 100.0), np.full(5, 100.0), 1.0, 1.0, None, 0.0, 0.0, 0.0)
+    assert [replace(row, measured=row.measured + by).gap_sign for by in (-1e-12, 1e-12, -0.1, 0.1)] == [0, 0, -1, 1]
+
+
+@pytest.mark.usefixtures("few_bootstraps")
+def test_the_range_is_that_from_the_starts_of_all_rounds(tmp_path: Path, series: list[Responses]) -> None:
+    """A single policy has more rounds than the random control, which is predicted from all the same."""
+    policies, calibration = {"p0": policy_of(0, series, robot=Shuttle(episode_limit=5))}, Calibration.of_series(series)
+    with FakeCulture() as culture:
+        gap = run_policies(policies, culture, calibration, tmp_path / "s", episodes=8)
+        with pytest.raises(InvalidArgument, match="seed: expected 0 or more, got -1"):
+            run_policies(policies, culture, calibration, tmp_path / "t", seed=-1)
+    p0, random = gap.rows[0], next(row for row in gap.rows if row.name == "random")
+    assert len(p0.measured) == 8 and len(random.measured) == 5 and gap.optimum is not None
+    assert p0.from_all_starts == pytest.approx(p0.predicted.mean())
+    assert random.expected is not None and random.predicted.mean() == pytest.approx(random.expected.mean())
+    assert gap.gap_share == pytest.approx(p0.gap.value / (gap.optimum - random.from_all_starts))
+
+
 @pytest.mark.oracle
 def test_known_starts_make_intervals_narrower_and_still_right() -> None:
     """Starts differ by three times as much as what follows them; some culture's responses to a start are unforeseen."""

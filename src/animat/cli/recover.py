@@ -38,6 +38,9 @@ class Recover(Command):
         if rows := [_cells(**agent) for agent in agents]:
             head = ["", "predicted", "its 95 % interval", "measured", "whole episodes"]
             print("\n".join(align_columns(head, rows)))
+            starts = {episode.start for episode in session.episodes}
+            if header.get("predicted") and session.ending.by != "plan" and len(starts) > 1:
+                print("  predicted: from the starts of all planned episodes; the measured ones had the first of them")
         if summary["unanswered_pulses"]:
             print(unanswered_message(session))
         if summary["lost_bytes"]:

@@ -133,7 +133,7 @@ class Run(StimulationOptions):
                     noticed=unknown,
                     pulse=loop.pulse,
                     # All, if the recordings do not state how many they used.
-                    patterns=None if patterns is None else min(patterns, len(culture.patterns)),
+                    patterns=None if patterns is None else min(patterns, len(culture.patterns)) or None,
                     **settings,
                 )
                 # Reported even if closing the culture fails.
@@ -240,7 +240,7 @@ class Run(StimulationOptions):
         try:
             culture.limits.check_pulse(pulse)
         except UnsafeStimulus as error:
-            source = "--recordings" if calibrating.protocol or not self.protocol else "--protocol"
+            source = "--recordings" if calibrating.pulse or not self.protocol else "--protocol"
             raise Mismatch(
                 f"{source}: expected a pulse that suits a {self.culture}, got another ({error}): record on that "
                 f"culture first, with animat record --culture {self.culture}, and train on those recordings"

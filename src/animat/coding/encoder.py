@@ -54,7 +54,7 @@ class Encoder:
         slowest_hz = min(min(condition.frequencies_hz) for condition in self.conditions)
         if self.pulses > slowest_hz / SLOWEST_HZ:
             most = int(slowest_hz / SLOWEST_HZ)
-            take = f"which take {self.pulses / slowest_hz:,g} s at {slowest_hz:g} Hz: use at most {most:,}"
+            take = f"which take {self.pulses / slowest_hz:,.10g} s at {slowest_hz:g} Hz: use at most {most:,}"
             expected = f"expected trials of {1 / SLOWEST_HZ:g} s at most"
             raise InvalidArgument(f"pulses: {expected}, got {shown(self.pulses)} pulses per trial, {take}")
 

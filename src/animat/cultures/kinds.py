@@ -63,8 +63,8 @@ def culture_of(
     raise InvalidArgument(f"culture: expected one of {', '.join(get_args(CultureKind))}, got {kind!r}")
 
 
-def pulse_for(kind: CultureKind) -> Pulse:
-    """The default pulse of a kind of culture."""
+def pulse_for(kind: str) -> Pulse:
+    """The default pulse of a kind of culture (`CultureKind`); of any other that of a simulated one."""
     if kind == "cl1":
         from animat.cultures.devices.cl1 import CL1_PULSE
 

@@ -252,11 +252,15 @@ def context_gap(
         # Derivatives of the gap: by coupling -1, by random stimuli gap, by optimum 1 - gap, each divided by the span.
         parts = np.array([errors[0], value * errors[1], (1 - value) * optimum.grid_error / _Z])
         spread = float(_Z * np.linalg.norm(parts) / span)
-        low = value - spread
-        # An optimum that its controller does not reach may be as low as what is achieved.
-        if optimum.findings() and (achieved := optimum.achieved[0]) < optimum.value:
-            unused = max(achieved - means[0], 0.0)
-            low = min(low, unused / (unused + means[0] - means[1]) - spread if unused else 0.0)
+        low, (achieved, error) = value - spread, optimum.achieved
+        # An optimum that its controller does not reach may be as low as what is achieved, by it or by the coupling.
+        if optimum.findings() and achieved < optimum.value:
+            least = 0.0
+            if achieved > max(means):
+                ratio = (achieved - means[0]) / (achieved - means[1])
+                parts = np.array([errors[0], ratio * errors[1], (1 - ratio) * error])
+                least = ratio - float(_Z * np.linalg.norm(parts) / (achieved - means[1]))
+            low = min(low, least)
         gap = Interval(value, low, value + spread)
     return ContextGap(means[0], errors[0], gap)
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Array, Float, Float32, Float64, Int32, Key, UInt16
+from jaxtyping import Float, Float32, Float64, Int32, UInt16
 
 from animat.arguments import checked_arguments
 from animat.environment import Animat, Environment, Neurons, WithoutNeurons
@@ -89,8 +89,8 @@ class Optimum:
     @property
     def achieved(self) -> tuple[float, float]:
         """The larger of its controller's returns, with its standard error; NaN if the controller was not run."""
-        known = self.monte_carlo, self.standard_error
-        return max(known, (self.without_clock, self.without_clock_standard_error))
+        runs = (self.monte_carlo, self.standard_error), (self.without_clock, self.without_clock_standard_error)
+        return max((run for run in runs if not math.isnan(run[0])), default=(math.nan, math.nan))
 
     def findings(self) -> tuple[Finding, ...]:
         """A warning if the value and its controller's return differ by more than chance and the grid's error."""
@@ -173,10 +173,10 @@ def best_returns(
     for start in range(0, len(cases), at_once):
         batch = cases[start : start + at_once]
         part = Part(progress, start, len(batch), len(cases))
-        on_coarse = _Programme(coarse, batch).run(None, _drawn(seed), Part(part, 0, 1, 4))
+        on_coarse = _Programme(coarse, batch).run(None, seed, Part(part, 0, 1, 4))
         programme = _Programme(fine, batch)
         tables = _Tables(fine, programme.n_layers, robot.episode_limit) if episodes else None
-        values = programme.run(tables, _drawn(seed), Part(part, 1, 3, 4))
+        values = programme.run(tables, seed, Part(part, 1, 3, 4))
         for case, (value, coarser) in enumerate(zip(values.tolist(), on_coarse.tolist(), strict=True)):
             run = math.nan, math.nan, math.nan, math.nan
             if tables is not None:
@@ -195,13 +195,7 @@ def optimal_values(
     They are means over `starts`; None: over starts that the robot draws.
     """
     programme = _Programme(grid, cases)
-    of = _drawn(seed) if starts is None else starts.of_episodes(starts.rounds)
-    return programme.run(None, of, progress or Silent()), programme.bounds
-
-
-def _drawn(seed: int) -> Key[Array, " starts"]:
-    """Keys from which the robot draws starts."""
-    return jax.random.split(jax.random.key(seed), _STARTS)
+    return programme.run(None, seed, progress or Silent(), starts), programme.bounds
 
 
 def _expect_known(environment: Environment[Any]) -> None:
@@ -282,7 +276,7 @@ class _Programme:
         self.bounds = -math.inf, math.inf
 
     def run(
-        self, tables: _Tables | None, starts: Key[Array, " starts"], progress: Progress
+        self, tables: _Tables | None, seed: int, progress: Progress, starts: Starts | None = None
     ) -> Float64[np.ndarray, " cases"]:
         """Step back from the end of an episode to its start; return the mean value there, store all in the tables."""
         grid = self._grid
@@ -306,7 +300,9 @@ class _Programme:
             progress.update(remaining + 1, self._robot.episode_limit)
         first = np.array([INITIAL_HISTORY])
         at_first = [of_case.start + int(self._layer(case, first)[0]) for case, of_case in enumerate(self._layers)]
-        return self._mean_over(values[:, at_first], jax.vmap(self._robot.reset)(starts))
+        drawn = jax.random.split(jax.random.key(seed), _STARTS)
+        states = jax.vmap(self._robot.reset)(drawn if starts is None else starts.of_episodes(starts.rounds))
+        return self._mean_over(values[:, at_first], states)
 
     def play(
         self, tables: _Tables, case: int, episodes: int, seed: int, *, clock: bool

@@ -110,8 +110,9 @@ def set_up(
         body = robot_named(robot, **parameters)
     except InvalidArgument as error:
         # A misspelt option is taken for a parameter of the robot.
-        hints = (did_you_mean(name, signature(set_up).parameters) for name in parameters)
-        raise InvalidArgument(f"{error}{next(filter(None, hints), '')}") from None
+        named = [name for name in parameters if str(error).endswith(repr(name))]
+        hint = did_you_mean(named[0], signature(set_up).parameters) if named else ""
+        raise InvalidArgument(f"{error}{hint}") from None
     if isinstance(body, HostRobot):
         raise InvalidArgument(
             f"robot: expected one stepped in JAX, got {body.name}, which Gymnasium steps: use it with animat train"

@@ -247,7 +247,7 @@ class _Run:
                 note += "; waiting for all policies to train on the newest recording"
             progress.update(min(passed_min, minute), self.timetable.duration_min, note)
         # A virtual culture's rest is computed now, which takes seconds.
-        progress.update(minute, self.timetable.duration_min, "the culture rests until its next recording is due")
+        progress.update(minute, self.timetable.duration_min, "the culture rests")
         self.culture.rest(max(0.0, self._zero_s + 60 * minute - self.culture.now_s))
 
     def _record(self, number: int, progress: Progress) -> SimulatorTimeline | None:

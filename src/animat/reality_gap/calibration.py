@@ -14,6 +14,9 @@ from animat.arguments import checked_arguments
 from animat.closed_loop.adaptive import AdaptiveThresholds, kept_counts
 from animat.coding.mapping import Thresholds
 from animat.cultures.base import Culture
+from animat.cultures.kinds import pulse_for
+from animat.cultures.replay import ReplayCulture
+from animat.errors import in_min
 from animat.neurons.history import Ranked
 from animat.neurons.history_tracker import AdjustedRanks, HistoryState, HistoryTracker
 from animat.neurons.memory import MemorySimulator
@@ -83,6 +86,23 @@ class Calibration:
         if culture.device is not None and self.recorded_at is not None:
             return (datetime.now(UTC) - self.recorded_at).total_seconds() / 60
         return culture.now_s / 60 - self.start_min
+
+    def delivered(self, culture: Culture) -> tuple[dict[str, Any], tuple[Finding, ...]]:
+        """The recording's pulse and number of patterns, as settings of a loop, and a finding without a known pulse.
+
+        A replay responds alike to every pulse, and its limits are those of voltages.
+        """
+        settings, recording, usual = dict[str, Any](), self.recording, pulse_for(culture.name)
+        if recording is not None and recording.protocol is not None:
+            settings["patterns"] = min(recording.protocol.patterns, len(culture.patterns)) or None
+        if recording is not None and (pulse := recording.pulse) is not None:
+            is_delivered = not isinstance(culture, ReplayCulture) or pulse.kind == usual.kind
+            return settings | {"pulse": pulse if is_delivered else usual}, ()
+        message = (
+            f"the recording at {in_min(self.start_min)}, which calibrates the loop, does not state its pulse: the loop "
+            f"delivers {usual}, the usual one; to change it, give `pulse`"
+        )
+        return settings | {"pulse": usual}, (Finding("unknown-pulse", "warning", message),)
 
     @property
     def remembering(self) -> HistoryTracker:

@@ -22,6 +22,7 @@ from animat.progress import Progress, Silent
 from animat.reality_gap.calibration import Calibration
 from animat.reality_gap.row import bootstrap_interval
 from animat.reality_gap.session_responses import CommandSums
+from animat.robots.base import Robot
 from animat.robots.host import HostRobot
 from animat.robots.starts import Starts
 
@@ -29,6 +30,8 @@ EPISODES = 200
 """Episodes of each policy and control in one roll-out."""
 ROLL_OUTS = 5
 """Roll-outs on the recording's simulator; there is one on each bootstrap simulator."""
+MOST_ON_HOST = 20
+"""Episodes of each policy in one roll-out of a robot that is stepped outside JAX, if they are short."""
 BOOTSTRAPS_ON_HOST = 40
 """Bootstraps for a robot that is stepped outside JAX: fewer, as an episode takes a thousand times as long."""
 
@@ -96,17 +99,15 @@ def predict(
     all episodes start alike.
     """
     progress = progress or Silent()
-    simulators, episodes_each = [calibration.simulator] * ROLL_OUTS + list(calibration.bootstraps), EPISODES
+    simulators = [calibration.simulator] * ROLL_OUTS + list(calibration.bootstraps)
     if isinstance(environment.robot, HostRobot):
         simulators = simulators[: ROLL_OUTS + BOOTSTRAPS_ON_HOST]
-        episodes_each = episodes_on_host(environment.robot)
-    rounds = 1 if starts is None else starts.rounds
-    episodes_each = rounds * math.ceil(episodes_each / rounds)
+    episodes, rounds = episodes_each(environment.robot, starts), 1 if starts is None else starts.rounds
     acting = [policies, *map(_with_random_actor, controls)]
 
     def run(number: int, on: int) -> Episodes:
         drawn = roll_out_seed(seed, number, on)
-        return acting[number].run(environment, simulators[on], episodes=episodes_each, seed=drawn, starts=starts)
+        return acting[number].run(environment, simulators[on], episodes=episodes, seed=drawn, starts=starts)
 
     predictions: dict[str, Prediction] = {}
     # A hanging body on the host is only noticed in the main thread (`animat.robots.host.time_limit`).
@@ -119,10 +120,10 @@ def predict(
         list(side_by_side(run, kinds.values(), repeat(0)))
         for number, control in enumerate(acting):
             progress.update(number, len(acting), control.name)
-            episodes = list(side_by_side(run, repeat(number), range(len(simulators))))
-            returns = np.array([each.returns for each in episodes])
-            presented = np.array([each.presented for each in episodes])
-            total = np.array([each.commanded for each in episodes]).reshape(*presented.shape, -1)
+            ran = list(side_by_side(run, repeat(number), range(len(simulators))))
+            returns = np.array([each.returns for each in ran])
+            presented = np.array([each.presented for each in ran])
+            total = np.array([each.commanded for each in ran]).reshape(*presented.shape, -1)
             rows = {name: [i] for i, name in enumerate(names)}
             if number:
                 rows = {control.name: [*range(control.actor.n_actors)]}
@@ -139,8 +140,14 @@ def predict(
 
 
 def episodes_on_host(robot: HostRobot) -> int:
-    """Episodes of each policy on each simulator: 20, or fewer if longer than 200 iterations, but at least 4."""
-    return max(4, min(20, 4_000 // robot.episode_limit))
+    """Fewest episodes of each policy: 20, or fewer if longer than 200 iterations, but at least 4."""
+    return max(4, min(MOST_ON_HOST, 4_000 // robot.episode_limit))
+
+
+def episodes_each(robot: Robot[Any], starts: Starts | None) -> int:
+    """Episodes of each policy in a roll-out, from each start equally many."""
+    least = episodes_on_host(robot) if isinstance(robot, HostRobot) else EPISODES
+    return least if starts is None else starts.rounds * math.ceil(least / starts.rounds)
 
 
 def roll_out_seed(seed: int, group: int, on: int) -> int:

@@ -38,6 +38,8 @@ class Row:
         turn: which of its agent's episodes each measured one is, where starts are drawn: in the same turn all agents
             have the same start; None where all episodes start alike.
         expected: mean predicted return from the start of each measured episode; None where all start alike.
+        from_all_starts: mean predicted return from the starts of all rounds, of which some may not be measured; NaN:
+            not known.
     """
 
     name: str
@@ -56,6 +58,7 @@ class Row:
     within: tuple[float, float] = (-np.inf, np.inf)
     turn: Int64[np.ndarray, " measured"] | None = None
     expected: Float64[np.ndarray, " measured"] | None = None
+    from_all_starts: float = np.nan
 
     @property
     def prediction(self) -> Interval:
@@ -64,8 +67,8 @@ class Row:
 
     @property
     def from_mean_start(self) -> Returns:
-        """Measured returns, less how much more or less is predicted from an episode's start than from all of them."""
-        return self.measured if self.expected is None else self.measured - self.expected + self.predicted.mean()
+        """Measured returns, less how much more is predicted from an episode's start than from those of all rounds."""
+        return self.measured if self.expected is None else self.measured - self.expected + self.from_all_starts
 
     @property
     def gap(self) -> Interval:
@@ -79,9 +82,12 @@ class Row:
         shows as a gap.
         """
         mean, expected = self.measured.mean(), self.predicted.mean()
-        returns, chance = self.from_mean_start, self.predicted
+        returns, chance = self.measured, self.predicted
         if self.expected is not None:
-            chance = (chance.reshape(len(returns), -1) - self.expected[:, None]).ravel() + expected
+            returns, chance = returns - self.expected + expected, chance.reshape(len(returns), -1)
+            # From each start a mean over few episodes, from which they differ too little.
+            wider = np.sqrt(chance.shape[1] / max(chance.shape[1] - 1, 1))
+            chance = ((chance - self.expected[:, None]) * wider).ravel() + expected
         drawn = resampled_means(returns, rng := np.random.default_rng(0), self.turn)
         if drawn is None:
             return Interval(float(mean - expected), -np.inf, np.inf, CONFIDENCE)
@@ -110,8 +116,9 @@ class Row:
         """-1 if less was measured than predicted, 1 if more, 0 if this cannot be determined."""
         if not len(self.measured):
             return 0
-        gap = self.gap
-        return -1 if gap.high < 0 else 1 if gap.low > 0 else 0
+        # Sums in float32 and float64 differ in the last digits.
+        gap, rounding = self.gap, 1e-6 * (1 + float(np.abs(self.measured).max()))
+        return -1 if gap.high < -rounding else 1 if gap.low > rounding else 0
 
     def to_dict(self) -> dict[str, Any]:
         measured = bool(len(self.measured))

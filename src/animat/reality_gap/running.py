@@ -21,10 +21,9 @@ from animat.coding.encoder import electrode_pulses
 from animat.cultures.base import Culture
 from animat.cultures.budget import Account
 from animat.cultures.failures import describe_error
-from animat.cultures.replay import ReplayCulture
 from animat.cultures.same_culture import differences
 from animat.environment import Animat, Environment
-from animat.errors import InvalidArgument, InvalidFile, UnusableData, in_min
+from animat.errors import InvalidArgument, InvalidFile, UnusableData, expect_at_least
 from animat.evaluation import transfer
 from animat.evaluation.controls import RANDOM, Control, controls_of, coupling_of, interventions_of
 from animat.evaluation.optimal_returns import too_few
@@ -38,9 +37,10 @@ from animat.reality_gap.outlook import outlook
 from animat.reality_gap.predicting import (
     BOOTSTRAPS_ON_HOST,
     EPISODES,
+    MOST_ON_HOST,
     ROLL_OUTS,
     Prediction,
-    episodes_on_host,
+    episodes_each,
     pool,
     predict,
 )
@@ -53,7 +53,6 @@ from animat.robots.base import Robot, lacking
 from animat.robots.grid import grid_for, why_no_grid
 from animat.robots.host import HostRobot
 from animat.robots.starts import Starts
-from animat.stimulation.pulse import PUBLISHED_PULSE
 from animat.training.policy import Policy, first_of_alike
 from animat.wrappers import NeuralObservation
 from animat.writing import expect_writable
@@ -116,26 +115,29 @@ def run_policies(
         UnusableData: for policies without neurons.
     """
     first = check_policies(policies)
+    expect_at_least("seed", seed, 0)
     transfer.expect_conditions(first, calibration.conditions, calibration.readouts)
     settings = {"burst_threshold": calibration.burst_threshold, **settings}
     if calibration.adaptive:
         settings["adaptive_from"] = calibration.adjusted
-    settings, unknown = _as_recorded(calibration, culture, settings)
+    delivered, unknown = calibration.delivered(culture)
+    if "pulse" in settings:
+        unknown = ()
+    settings = delivered | settings
     # The recording's conditions have their stimuli: older policies do not know those of patterns.
     settings["conditions"] = calibration.conditions
     if first.neural_observation:
         settings["remembering"] = calibration.remembering
     loop, findings = Loop.of_policy(first, calibration.percentiles, pulses=pulses, **settings)
-    age_min = calibration.age_min(culture)
+    age_min, starts = calibration.age_min(culture), _starts(loop.robot, seed, episodes)
     if calibration.recording is not None:
         unknown += differences(calibration.recording, culture, patterns_too=loop.encoder.takes_patterns)
-    findings = unknown + findings + tuple(_warnings(first, loop, calibration, age_min))
+    findings = unknown + findings + tuple(_warnings(first, loop, calibration, age_min, starts))
     account = account or Account()
     animat = Animat(loop.robot, loop.mapping, len(loop.conditions))
     environment: Environment[Any] = NeuralObservation(animat) if first.neural_observation else animat
     simulator = calibration.simulator
     networks = networks_of(list(policies.values()), greedy=greedy)
-    starts = _starts(loop.robot, seed, episodes)
     trained, controls = Control("policies", "as trained", networks), [RANDOM]
     lacks = lacking(loop.robot)
     if with_controls:
@@ -237,30 +239,9 @@ def run_policies(
     return gap
 
 
-def _as_recorded(
-    calibration: Calibration, culture: Culture, settings: dict[str, Any]
-) -> tuple[dict[str, Any], tuple[Finding, ...]]:
-    """Settings with the pulse and the patterns of the calibrating recording, and a finding if it does not state them.
-
-    A replay responds alike to every pulse, and its limits are those of voltages.
-    """
-    own, recording = dict[str, Any](), calibration.recording
-    if recording is not None and recording.protocol is not None:
-        own["patterns"] = min(recording.protocol.patterns, len(culture.patterns)) or None
-    if recording is not None and (pulse := recording.pulse) is not None:
-        is_delivered = not isinstance(culture, ReplayCulture) or pulse.kind == PUBLISHED_PULSE.kind
-        own["pulse"] = pulse if is_delivered else PUBLISHED_PULSE
-    settings = own | settings
-    if "pulse" in settings:
-        return settings, ()
-    message = (
-        f"the recording at {in_min(calibration.start_min)}, which calibrates the loop, does not state its pulse: the "
-        f"loop delivers {PUBLISHED_PULSE}, the usual one; to change it, give `pulse`"
-    )
-    return settings, (Finding("unknown-pulse", "warning", message),)
-
-
-def _warnings(first: Policy, loop: Loop, calibration: Calibration, age_min: float) -> Iterator[Finding]:
+def _warnings(
+    first: Policy, loop: Loop, calibration: Calibration, age_min: float, starts: Starts | None
+) -> Iterator[Finding]:
     """Known reasons why the measured return may differ from the prediction."""
     yield from transfer.other_calibration(first.presentation, calibration.presentation)
     if first.delivery == "shuffled":
@@ -287,7 +268,7 @@ def _warnings(first: Policy, loop: Loop, calibration: Calibration, age_min: floa
     yield from transfer.old_calibration(age_min, "this session")
     yield from transfer.no_memory(calibration.findings, calibration.presentation, has_memory=has_memory)
     if isinstance(loop.robot, HostRobot):
-        episodes_predicted = ROLL_OUTS * episodes_on_host(loop.robot)
+        episodes_predicted = ROLL_OUTS * episodes_each(loop.robot, starts)
         message = (
             f"{loop.robot.name} is stepped outside JAX: predicted returns are from {episodes_predicted} episodes, and "
             f"their intervals from {BOOTSTRAPS_ON_HOST} bootstraps"
@@ -297,7 +278,7 @@ def _warnings(first: Policy, loop: Loop, calibration: Calibration, age_min: floa
 
 def _starts(robot: Robot[Any], seed: int, episodes: int) -> Starts | None:
     """The starts of a session's rounds; None if all are alike, or too many to predict from each of them."""
-    most = episodes_on_host(robot) if isinstance(robot, HostRobot) else EPISODES
+    most = MOST_ON_HOST if isinstance(robot, HostRobot) else EPISODES
     return starts_of(robot, seed, episodes) if 1 <= episodes <= most else None
 
 
@@ -385,6 +366,7 @@ def _rows(
             within=loop.robot.return_range,
             turn=turn,
             expected=expected,
+            from_all_starts=float(every.returns.mean()),
         )
 
     policies = row("policies" if len(names) > 1 else names[0], "as trained", names)

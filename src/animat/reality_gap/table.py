@@ -94,7 +94,8 @@ class RealityGap:
         """The policies' gap as a share of the range from predicted random return to the optimum."""
         if self.optimum is None:
             return None
-        range_ = self.optimum - next(row for row in self.rows if row.name == "random").predicted.mean()
+        # Both from the starts of all rounds.
+        range_ = self.optimum - next(row for row in self.rows if row.name == "random").from_all_starts
         return float(self.rows[0].gap.value / range_) if len(self.rows[0].measured) and range_ > 0 else None
 
     def verdict(self) -> str:
@@ -233,8 +234,11 @@ def _intervention_lines(policies: Row, table: Sequence[Intervention]) -> list[st
 
 
 def _lost(usual: Row, changed: Returns, turn: Turns | None) -> Interval:
-    """Difference of means, with its interval over episodes (`resampled_means`); infinite where they are too few."""
-    value, rng = float(usual.measured.mean() - changed.mean()), np.random.default_rng(0)
+    """Difference of means, with its interval over episodes (`resampled_means`); infinite where they are too few.
+
+    Both are as if from the starts of all rounds (`Row.from_mean_start`), as some agents may have had fewer.
+    """
+    value, rng = float(usual.from_mean_start.mean() - changed.mean()), np.random.default_rng(0)
     one, other = resampled_means(usual.from_mean_start, rng, usual.turn), resampled_means(changed, rng, turn)
     if one is None or other is None:
         return Interval(value, -np.inf, np.inf, CONFIDENCE)
