@@ -212,10 +212,8 @@ class Run(StimulationOptions):
             )
         protocol = calibrating.protocol or option
         patterns = None if protocol is None else protocol.patterns
-        if (pulse := calibrating.pulse or given) is not None:
-            # A replay responds alike to every pulse, and its limits are those of voltages.
-            is_delivered = self.culture != "replay" or pulse.kind == usual.kind
-            return pulse if is_delivered else usual, patterns, []
+        if (stated_here := calibrating.pulse or given) is not None:
+            return pulse_for(self.culture, stated_here), patterns, []
         pulse = next(iter(pulses), usual)
         source = "as in the other recordings" if pulses else f"the usual one with --culture {self.culture}"
         message = (

@@ -63,8 +63,13 @@ def culture_of(
     raise InvalidArgument(f"culture: expected one of {', '.join(get_args(CultureKind))}, got {kind!r}")
 
 
-def pulse_for(kind: str) -> Pulse:
-    """The default pulse of a kind of culture (`CultureKind`); of any other that of a simulated one."""
+def pulse_for(kind: str, recorded: Pulse | None = None) -> Pulse:
+    """The pulse for a kind of culture (`CultureKind`): the recorded one, or by default the usual one.
+
+    A replay responds alike to every pulse, and its limits are those of voltages.
+    """
+    if recorded is not None and (kind != "replay" or recorded.kind == PUBLISHED_PULSE.kind):
+        return recorded
     if kind == "cl1":
         from animat.cultures.devices.cl1 import CL1_PULSE
 

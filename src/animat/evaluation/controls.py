@@ -18,6 +18,7 @@ from animat.evaluation.rollouts import Actor, Constant, Episodes, Networks, Unif
 from animat.evaluation.statistics import standard_error
 from animat.neurons.simulator import NeuronSimulator, indifferent, silenced
 from animat.robots.host import HostRobot
+from animat.robots.starts import Starts
 
 Delivered = Literal["chosen", "shuffled", "silent", "yoked"]
 """What neurons are given; in training (`animat.wrappers.Delivery`) only the first two exist."""
@@ -69,9 +70,18 @@ class Control:
             environment = wrappers.GoalSwitch(environment, self.switch_at)
         return environment, simulator
 
-    def run(self, environment: Environment[Any], simulator: Neurons, **settings: Any) -> Episodes:
-        """Its episodes in the policies' environment and simulator, changed for it; settings as for `roll_out`."""
-        return roll_out(*self.within(environment, simulator), self.actor, **settings)
+    def run(
+        self,
+        environment: Environment[Any],
+        simulator: Neurons,
+        *,
+        episodes: int,
+        seed: int,
+        starts: Starts | None = None,
+    ) -> Episodes:
+        """Its episodes in the policies' environment and simulator, changed for it; errors as in `roll_out`."""
+        changed = self.within(environment, simulator)
+        return roll_out(*changed, self.actor, episodes=episodes, seed=seed, starts=starts)
 
 
 RANDOM = Control("random", "any action, equally likely", Uniform())

@@ -83,14 +83,23 @@ def old_calibration(age_min: float, now: str) -> Iterator[Finding]:
         yield Finding("old-calibration", "warning", message, age_min)
 
 
-def no_memory(noticed: Iterable[Finding], presentation: Presentation | None, *, has_memory: bool) -> Iterator[Finding]:
-    """A warning if the recording shows that the culture has memory, but the predicting simulator has none."""
+def no_memory(
+    noticed: Iterable[Finding],
+    presentation: Presentation | None,
+    *,
+    has_memory: bool,
+    setting: str = "--simulator memory",
+) -> Iterator[Finding]:
+    """A warning if the recording shows that the culture has memory, but the predicting simulator has none.
+
+    `setting` is what gives it one.
+    """
     remembers = next((finding for finding in noticed if finding.name == "memory"), None)
     if remembers is None or has_memory:
         return
     # The finding on recordings in blocks has its remedy already.
     blocked = presentation is not None and presentation.order == "blocked"
-    remedy = "" if blocked else " (--simulator memory)"
+    remedy = "" if blocked else f" ({setting})"
     message = f"{remembers.message}: the measured return may differ from the prediction{remedy}"
     yield Finding("no-memory", "warning", message, remembers.value)
 

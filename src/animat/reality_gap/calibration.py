@@ -15,7 +15,6 @@ from animat.closed_loop.adaptive import AdaptiveThresholds, kept_counts
 from animat.coding.mapping import Thresholds
 from animat.cultures.base import Culture
 from animat.cultures.kinds import pulse_for
-from animat.cultures.replay import ReplayCulture
 from animat.errors import in_min
 from animat.neurons.history import Ranked
 from animat.neurons.history_tracker import AdjustedRanks, HistoryState, HistoryTracker
@@ -88,21 +87,19 @@ class Calibration:
         return culture.now_s / 60 - self.start_min
 
     def delivered(self, culture: Culture) -> tuple[dict[str, Any], tuple[Finding, ...]]:
-        """The recording's pulse and number of patterns, as settings of a loop, and a finding without a known pulse.
-
-        A replay responds alike to every pulse, and its limits are those of voltages.
-        """
-        settings, recording, usual = dict[str, Any](), self.recording, pulse_for(culture.name)
+        """The recording's pulse and number of patterns, as settings of a loop, and a finding without a known pulse."""
+        recording = self.recording
+        stated = None if recording is None else recording.pulse
+        settings: dict[str, Any] = {"pulse": pulse_for(culture.name, stated)}
         if recording is not None and recording.protocol is not None:
             settings["patterns"] = min(recording.protocol.patterns, len(culture.patterns)) or None
-        if recording is not None and (pulse := recording.pulse) is not None:
-            is_delivered = not isinstance(culture, ReplayCulture) or pulse.kind == usual.kind
-            return settings | {"pulse": pulse if is_delivered else usual}, ()
+        if stated is not None:
+            return settings, ()
         message = (
             f"the recording at {in_min(self.start_min)}, which calibrates the loop, does not state its pulse: the loop "
-            f"delivers {usual}, the usual one; to change it, give `pulse`"
+            f"delivers {settings['pulse']}, the usual one; to change it, give `pulse`"
         )
-        return settings | {"pulse": usual}, (Finding("unknown-pulse", "warning", message),)
+        return settings, (Finding("unknown-pulse", "warning", message),)
 
     @property
     def remembering(self) -> HistoryTracker:

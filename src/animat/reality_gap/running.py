@@ -156,7 +156,7 @@ def run_policies(
             raise InvalidArgument(
                 f"--interventions: expected a robot in JAX, got {loop.robot.name}, which is stepped outside JAX"
             )
-        simulated = {"episodes": INTERVENTION_EPISODES, "seed": seed, "starts": starts}
+        simulated: dict[str, Any] = {"episodes": INTERVENTION_EPISODES, "seed": seed, "starts": starts}
         half_way = trained.run(environment, simulator, **simulated).half_way
         actuator, *changed = interventions_of(environment, simulator, networks, switch_at=half_way)
         ideal = actuator, actuator.run(environment, simulator, **simulated).returns.ravel()

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
-from animat.evaluation.optimum import bracket_findings
+from animat.evaluation.optimum import Optimum
 from animat.recordings.findings import Finding
 
 TRAINED = "trained: "
@@ -38,13 +39,18 @@ class StudyOptimum:
     nodes: int | None
     left_out: str | None
 
+    @property
+    def known(self) -> Optimum | None:
+        """The same with NaN for unknown values; None without a value."""
+        if self.best_return is None or self.grid_error is None:
+            return None
+        runs = self.monte_carlo, self.standard_error, self.without_clock, self.without_clock_standard_error
+        timed, its_error, untimed, error = (math.nan if each is None else each for each in runs)
+        return Optimum(self.best_return, self.grid_error, timed, its_error, untimed, error, 0, self.nodes or 0)
+
     def findings(self) -> tuple[Finding, ...]:
         """A finding if the value and the better return of its controller differ."""
-        runs = (self.monte_carlo, self.standard_error), (self.without_clock, self.without_clock_standard_error)
-        achieved = [(mean, error) for mean, error in runs if mean is not None and error is not None]
-        if self.best_return is None or self.grid_error is None or not achieved:
-            return ()
-        return bracket_findings(self.best_return, self.grid_error, *max(achieved))
+        return () if self.known is None else self.known.findings()
 
 
 @dataclass(frozen=True)

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from math import nan
 
 from animat.evaluation.coupling import REFLEX_GAP, context_gap
-from animat.evaluation.optimum import Optimum
 from animat.evaluation.statistics import Interval, compare_episodes, is_worse
 from animat.report.results import HeuristicComparison, ReflexComparison, Results, StudyOptimum
 from animat.studies.episodes import COUPLING, POLICY, RANDOM, DataFrame, mean_returns, rows_where
@@ -58,12 +56,9 @@ def compare_with_reflex(
         for at_min, coupled in rows_where(controls, agent=COUPLING).groupby("at_min")["return"]:
             best = known.get(key_of(arm, at_min))
             policies = rows_where(at, arm=arm.name, agent=POLICY, at_min=at_min)
-            if best is None or best.best_return is None:
+            if best is None or (optimum := best.known) is None:
                 continue
             random = rows_where(controls, agent=RANDOM, at_min=at_min)["return"].to_numpy()
-            runs = best.monte_carlo, best.standard_error, best.without_clock, best.without_clock_standard_error
-            timed, its_error, untimed, error = (nan if each is None else each for each in runs)
-            optimum = Optimum(best.best_return, best.grid_error or 0.0, timed, its_error, untimed, error, 0, 0)
             context = context_gap(coupled.to_numpy(), random, optimum)
             yield ReflexComparison(
                 spec.name,

@@ -81,14 +81,8 @@ class Fit(StudyTask):
     def make(self, folder: Path, progress: Progress) -> list[Path]:
         study, series = self.study, read_series(self.study, folder)
         timeline = fit_simulators(study, series)
-        timeline = replace(
-            timeline,
-            findings=(
-                *timeline.findings,
-                *_moved(study, timeline.start_min.tolist()),
-                *_no_memory(timeline),
-            ),
-        )
+        noticed = *timeline.findings, *_moved(study, timeline.start_min.tolist()), *_no_memory(timeline)
+        timeline = replace(timeline, findings=noticed)
         return [save_timeline(timeline, folder / TIMELINE), _write_responses(folder / RESPONSES, series)]
 
 
@@ -131,9 +125,8 @@ def _no_memory(timeline: SimulatorTimeline) -> Iterator[Finding]:
     """
     presentation = timeline.presentation
     if presentation is None or presentation.order != "blocked":
-        has_memory = timeline.fitted["kind"] == "memory"
-        for finding in no_memory(timeline.findings, presentation, has_memory=has_memory):
-            yield replace(finding, message=finding.message.replace("--simulator memory", 'simulators.kind = "memory"'))
+        has_memory, setting = timeline.fitted["kind"] == "memory", 'simulators.kind = "memory"'
+        yield from no_memory(timeline.findings, presentation, has_memory=has_memory, setting=setting)
 
 
 def _moved(study: Study, start_min: list[float]) -> Iterator[Finding]:
