@@ -17,7 +17,7 @@ from jaxtyping import Int64
 
 from animat.cultures.failures import as_device_failure
 from animat.cultures.limits import Limits
-from animat.cultures.observed import Observed, Spikes, assemble, with_rests
+from animat.cultures.observed import Observed, Spikes, assemble, following, with_rests
 from animat.cultures.openable import Openable
 from animat.cultures.safety import SIMULATED_LIMITS, Admitted
 from animat.errors import AnimatError, InvalidArgument, expect_kind, some_of
@@ -28,7 +28,7 @@ from animat.stimulation.places import electrodes_of
 from animat.stimulation.plain import number, seconds
 from animat.stimulation.protocol import Protocol
 from animat.stimulation.pulse import Pulse
-from animat.stimulation.schedule import Block, Schedule, make_schedule
+from animat.stimulation.schedule import SHORTEST_GAP_S, Block, Schedule, make_schedule
 from animat.stimulation.stimulus import Stimulus, plain_stimuli
 from animat.tables import UNKNOWN
 
@@ -36,6 +36,8 @@ _BEFORE_ALL = ("__getattribute__", "__setattr__", "__delattr__", "__copy__", "__
 """Python calls these before, or instead of, the base class's attributes."""
 _REPLACEABLE = ("__init__", "left_out", "device", "recorded_as", "stretch_s")
 """What a backend may override although it is not abstract."""
+_GAP_ON_DEVICE_S = 0.1
+"""Shortest gap between two pulses in which a block is cut on a device, whose clock runs on meanwhile."""
 
 
 class Culture(Openable):
@@ -104,7 +106,7 @@ class Culture(Openable):
 
     @property
     def stretch_s(self) -> float | None:
-        """How much of a block `record` requests at a time; None: all of it, as the clock runs between calls."""
+        """How much of a block `record` requests at a time, at least; None: all of it."""
         return None
 
     @abc.abstractmethod
@@ -218,14 +220,16 @@ class Culture(Openable):
         """Stimulate by a protocol and record.
 
         The whole schedule is checked before anything is delivered. Set-up times pass unobserved and are left out of the
-        recording's clock, on which blocks follow one another directly.
+        recording's clock, on which blocks follow one another directly. The clock of a device runs on between two
+        stretches of a block: the next one makes up for it as far as it can, and the recording counts the time in which
+        nothing was observed among what it left out.
 
         Args:
             protocol: what to do; it is kept with the recording.
             seed: decides the order of conditions and patterns.
             progress: updated after each block, or stretch of one (`stretch_s`).
-            follow: then called, except at the end, with a function that returns the recording so far. The time it takes
-                is subtracted from the next set-up time.
+            follow: then called, except at the end, with a function that returns the recording so far, also later, if
+                an error or Ctrl-C ends it. The time it takes is subtracted from the next set-up time.
 
         Raises:
             UnsafeStimulus, InvalidArgument, DeviceFailed: as `deliver` does.
@@ -239,26 +243,38 @@ class Culture(Openable):
         self._rehearse(schedule)
         about = {"channels": self.channels, "culture": self.recorded_as, "provenance": provenance, "recorded_at": date}
         start_min, rate_hz, before = self.now_s / 60, self.sampling_rate_hz, self.left_out
-        parts, observed = list[Block](), list[Observed]()
+        parts = list[tuple[Block, Observed]]()
 
         def so_far() -> Recording:
-            blocks = replace(schedule, blocks=tuple(parts))
-            return assemble(blocks, observed, sampling_rate_hz=rate_hz, start_min=start_min, **about)
+            blocks, observed = zip(*parts, strict=True)
+            recorded = replace(schedule, blocks=blocks)
+            return assemble(recorded, observed, sampling_rate_hz=rate_hz, start_min=start_min, **about)
 
-        followed_s = 0.0
+        followed_s = unobserved_s = 0.0
+        # A clock that stands still between calls needs no gap to make up for.
+        gap_s = SHORTEST_GAP_S if self.device is None else _GAP_ON_DEVICE_S
         for done, block in enumerate(schedule.blocks):
             self.rest(max(0.0, block.setup_s - followed_s))
-            stretches = (block,) if self.stretch_s is None else block.stretches(self.stretch_s)
+            stretches = (block,) if self.stretch_s is None else block.stretches(self.stretch_s, gap_s)
             for i, stretch in enumerate(stretches, 1):
-                observed.append(self.deliver(schedule.deliveries(stretch), stretch.duration_s))
-                parts.append(stretch)
+                ended_s = None
+                if i > 1 and self.device is not None:
+                    ended_s = min(self.now_s, _ended_s(*parts[-1]))
+                observed = self.deliver(schedule.deliveries(stretch), stretch.duration_s, since_s=ended_s)
+                if ended_s is not None:
+                    observed, missed_s = following(parts[-1][1], observed)
+                    unobserved_s += missed_s
+                parts.append((stretch, observed))
                 progress.update(done + i / len(stretches), len(schedule.blocks))
                 if follow is not None and (i < len(stretches) or done + 1 < len(schedule.blocks)):
                     seen_s = self.now_s
                     follow(so_far)
                     followed_s = self.now_s - seen_s
-        if more := Counter(self.left_out) - Counter(before):
-            provenance["left_out"] = ", ".join(f"{count} {what}" for what, count in more.items())
+        more = [f"{count} {what}" for what, count in (Counter(self.left_out) - Counter(before)).items()]
+        if unobserved_s:
+            more.append(f"{1000 * unobserved_s:.0f} ms between stretches")
+        if more:
+            provenance["left_out"] = ", ".join(more)
         return so_far()
 
     def _rehearse(self, schedule: Schedule) -> None:
@@ -271,6 +287,11 @@ class Culture(Openable):
             offset_s += block.duration_s
         with self._opened() as guard:
             guard.check(pulses, self.now_s)
+
+
+def _ended_s(stretch: Block, observed: Observed) -> float:
+    """When a delivered stretch ended on the culture's clock: as long after its last stimulus as it was meant to."""
+    return float(observed.start_s + observed.stimulus_time_s[-1] + stretch.duration_s - stretch.stimuli.time_s[-1])
 
 
 def _plain_request(stimuli: Iterable[Stimulus], duration_s: float) -> tuple[Sequence[Stimulus], float]:

@@ -57,6 +57,14 @@ def observed_in_frames(
     return Observed((start - zero) / rate, (stop - start) / rate, spikes, (begun - start) / rate)
 
 
+def following(before: Observed, observed: Observed) -> tuple[Observed, float]:
+    """An observation that begins where the one before it ended, and the seconds in between, which nobody observed."""
+    missed_s = max(0.0, observed.start_s - before.start_s - before.duration_s)
+    spikes = Spikes(observed.spikes.time_s + missed_s, observed.spikes.channel)
+    start_s, duration_s = observed.start_s - missed_s, observed.duration_s + missed_s
+    return Observed(start_s, duration_s, spikes, observed.stimulus_time_s + missed_s), missed_s
+
+
 def with_rests(observed: Observed, stimuli: Sequence[Stimulus], now_s: float) -> Observed:
     """The observation of a delivery with the times of all requested stimuli, rests among them, counted from `now_s`.
 

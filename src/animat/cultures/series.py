@@ -120,7 +120,7 @@ def record_series(
         if virtual is None:
             zero_s = _start_s(made, culture, protocol, interval_s)
         clear_leftovers(folder, "recording_*_min.nwb", STATE_FILE, SELECTION_FILE)
-        follow = opened.enter_context(PartialRecording(folder))
+        follow = opened.enter_context(PartialRecording(folder, culture.device is not None))
         if virtual is not None and not (recorded and (folder / SELECTION_FILE).exists()):
             virtual.selection.save(folder / SELECTION_FILE)
         if virtual is not None and not recorded:

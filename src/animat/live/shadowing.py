@@ -255,7 +255,7 @@ class _Run:
         began_s = time.monotonic()
         folder = self.folder / RECORDINGS
         # Locked as by `animat record`, so that viewers know that it is in progress.
-        with exclusive_lock(folder), PartialRecording(folder) as follow:
+        with exclusive_lock(folder), PartialRecording(folder, self.culture.device is not None) as follow:
             # Check the space before stimulating the culture.
             expect_writable(folder, room_bytes=room_bytes_of(self.protocol))
             seed = order_seed(self.training.seed, number)

@@ -17,7 +17,7 @@ from animat.tables import UNKNOWN, padded
 
 TICK_S = 50e-6
 """Stimuli start on a grid of 50 us, one sample at 20 kHz, which stimulation hardware can time exactly."""
-_GAP_S = 0.005
+SHORTEST_GAP_S = 0.005
 """Shortest gap between two pulses in which a block may be cut."""
 
 
@@ -32,10 +32,14 @@ class Block:
     duration_s: float
     stimuli: Stimuli
 
-    def stretches(self, least_s: float) -> tuple[Block, ...]:
-        """The block cut between trials into consecutive stretches without set-up, of `least_s` or more but the last."""
+    def stretches(self, least_s: float, gap_s: float = SHORTEST_GAP_S) -> tuple[Block, ...]:
+        """The block cut into consecutive stretches without set-up, of `least_s` or more but the last.
+
+        It is cut between trials, in the middle of gaps between pulses of `gap_s` or more.
+        """
         time_s, presentation = self.stimuli.time_s, self.stimuli.presentation
-        begins = 1 + np.flatnonzero((np.diff(presentation) != 0) & (np.diff(time_s) >= _GAP_S))
+        # The grid of times is coarser than rounding errors.
+        begins = 1 + np.flatnonzero((np.diff(presentation) != 0) & (np.diff(time_s) >= gap_s - TICK_S / 2))
         cuts = [(0, 0.0)]
         for row, end_s in zip(begins.tolist(), on_ticks((time_s[begins - 1] + time_s[begins]) / 2), strict=True):
             if end_s - cuts[-1][1] >= least_s:

@@ -82,6 +82,7 @@ class CL1Culture(Culture):
 
     name: ClassVar[str] = "cl1"
     sampling_rate_hz = float(FRAMES_PER_S)
+    stretch_s = 60.0
     stimulation_electrodes = SITES
 
     def __init__(

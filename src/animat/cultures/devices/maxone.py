@@ -77,6 +77,7 @@ class MaxOneCulture(Culture):
 
     name: ClassVar[str] = "maxone"
     sampling_rate_hz = float(FRAMES_PER_S)
+    stretch_s = 60.0
     recorded_as = RecordedCulture("maxone")
 
     def __init__(

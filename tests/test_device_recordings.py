@@ -1,0 +1,124 @@
+"""Recordings of devices, whose clock runs on between requests; against the stand-ins of CL1 and MaxOne."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from animat.cultures.base import Culture
+from animat.cultures.devices.cl1 import CL1_PULSE, CL1Culture
+from animat.cultures.series import record_series
+from animat.errors import DeviceFailed
+from animat.recordings.reading import read_recording, read_recordings
+from animat.recordings.recording import Recording
+from animat.stimulation.protocol import Protocol
+from animat.stimulation.pulse import BALANCED_PULSE
+from stand_in_cl import Neurons
+from stand_in_cl import install as install_cl
+from stand_in_maxlab import Rig
+from stand_in_maxlab import install as install_maxlab
+from test_maxone import culture_on
+
+MIXED = Protocol(order="mixed", trials=400, patterns=20, setup_s=0.1)
+
+
+def on_cl1(patch: pytest.MonkeyPatch) -> tuple[Culture, Callable[[float], None], Callable[[], np.ndarray], int]:
+    """A culture on a stand-in, what lets time pass between requests, when pulses came, and its frames a second."""
+    neurons: Neurons = install_cl(patch)
+
+    def run_on(seconds: float) -> None:
+        neurons.now += round(25_000 * seconds)
+
+    return CL1Culture(), run_on, lambda: np.array(sorted({frame for frame, *_ in neurons.pulses})), 25_000
+
+
+def on_maxone(patch: pytest.MonkeyPatch) -> tuple[Culture, Callable[[float], None], Callable[[], np.ndarray], int]:
+    rig: Rig = install_maxlab(patch)
+
+    def run_on(seconds: float) -> None:
+        rig.now += round(20_000 * seconds)
+
+    return culture_on(rig), run_on, lambda: np.array(sorted({pulse.frame for pulse in rig.delivered})), 20_000
+
+
+@pytest.mark.parametrize("device", [on_cl1, on_maxone])
+@pytest.mark.parametrize("between_s", [0.0, 0.03, 0.2])
+def test_a_long_block_is_recorded_in_stretches_and_the_clock_keeps_count(
+    device: Callable, between_s: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    culture, run_on, pulsed, rate_hz = device(monkeypatch)
+    protocol = Protocol(**vars(MIXED) | {"pulse": CL1_PULSE if rate_hz == 25_000 else BALANCED_PULSE})
+    seen: list[Recording] = []
+
+    def follow(so_far: Callable[[], Recording]) -> None:
+        seen.append(so_far())
+        run_on(between_s)
+
+    with culture:
+        (block,) = culture.schedule(protocol, 3).blocks
+        recording = culture.record(protocol, 3, follow=follow)
+    frames = pulsed()
+    cuts = [len(part.stimuli) for part in seen]
+    # 155 s in stretches of at least 60 s, cut where the next pulse is 0.1 s away or more.
+    assert len(cuts) == 2 and len(frames) == len(recording.stimuli) == 2000
+    assert all(np.diff(block.stimuli.time_s)[cut - 1] > 0.0999 for cut in cuts)
+    # The recording's times are the device's, also across the cuts.
+    since_s = (frames - frames[0]) / rate_hz
+    assert np.abs(recording.stimuli.time_s - recording.stimuli.time_s[0] - since_s).max() < 1.5 / rate_hz
+    # Half of the gap at a cut makes up for the time between two requests; what is more makes it longer.
+    asked_s = np.diff(block.stimuli.time_s)[[cut - 1 for cut in cuts]]
+    gap_s = np.diff(since_s)[[cut - 1 for cut in cuts]]
+    delay_s = np.maximum(0.0, between_s - asked_s / 2)
+    assert np.all(gap_s > asked_s + delay_s - 2 / rate_hz) and np.all(gap_s < asked_s + delay_s + 0.01)
+    # Each pulse that the stand-in answers has its spikes where they belong.
+    answer_s = 0.005 if rate_hz == 20_000 else 0.0
+    answered = np.arange(2000) if answer_s else np.flatnonzero(frames % 7 == 0)
+    came_s = np.unique(recording.spike_times_s)
+    expected_s = recording.stimuli.time_s[answered] + answer_s
+    assert np.all(np.abs(came_s[np.searchsorted(came_s, expected_s - 1e-6)] - expected_s) < 1.5 / rate_hz)
+    left_out = recording.provenance.get("left_out", "")
+    assert ("ms between stretches" in left_out) == (between_s > 0)
+    if between_s:
+        assert f"{2000 * between_s:.0f} ms between stretches" in left_out
+
+
+@pytest.mark.parametrize("device", [on_cl1, on_maxone])
+@pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError("a broken cable")])
+def test_what_was_recorded_before_an_error_is_kept(
+    device: Callable, error: BaseException, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    culture, _, pulsed, rate_hz = device(monkeypatch)
+    protocol = Protocol(**vars(MIXED) | {"pulse": CL1_PULSE if rate_hz == 25_000 else BALANCED_PULSE})
+    deliver = type(culture)._deliver
+    calls: list[int] = []
+
+    def fail_third(self: Culture, admitted: object, duration_s: float) -> object:
+        calls.append(1)
+        if len(calls) == 3:
+            raise error
+        return deliver(self, admitted, duration_s)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(type(culture), "_deliver", fail_third)
+    with pytest.raises((KeyboardInterrupt, DeviceFailed)) as raised:
+        record_series(lambda: culture, protocol, tmp_path, sessions=2, interval_min=5.0)
+    (file,) = (tmp_path / "interrupted").iterdir()
+    kept = read_recording(file)
+    assert any("2.0 min with 1,5" in note and str(file) in note for note in raised.value.__notes__)
+    assert len(kept.stimuli) == len(pulsed()) and 120 <= kept.duration_s < 121
+    assert json.loads(kept.protocol.to_json())["trials"] == 400  # type: ignore[union-attr]
+    # On another day the clock begins at 0 again: that one has another name.
+    before, calls[:] = file.read_bytes(), []
+    culture = device(monkeypatch)[0]
+    with pytest.raises((KeyboardInterrupt, DeviceFailed)):
+        record_series(lambda: culture, protocol, tmp_path, sessions=2, interval_min=5.0)
+    assert len(list((tmp_path / "interrupted").iterdir())) == 2 and file.read_bytes() == before
+    # The series goes on without them.
+    monkeypatch.setattr(type(culture), "_deliver", deliver)
+    culture = device(monkeypatch)[0]
+    series = record_series(lambda: culture, protocol, tmp_path, sessions=1, interval_min=5.0)
+    assert [len(recording.stimuli) for recording in read_recordings([tmp_path])] == [2000]
+    assert len(series.files) == 1 and not list(tmp_path.glob(".*"))
