@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -108,6 +109,14 @@ def test_silences_are_reported_with_their_times() -> None:
     assert two.value == pytest.approx(130, abs=0.1) and ", from 899.9" in two.message
     # Less than a hundredth of the recording changes no rate by much.
     assert "silence" not in said(poisson([(400, 405)]))
+
+
+@pytest.mark.parametrize("duration_s", [200.0, 1000.0, 40_000.0])
+def test_a_recording_that_is_empty_from_some_time_on_causes_a_warning(duration_s: float) -> None:
+    recorded = replace(poisson([], 100.0), duration_s=duration_s)
+    message = said(recorded)["silence"]
+    assert f"to {duration_s:g} s" in message and "or did it end earlier than stated?" in message
+    assert "end earlier" not in said(poisson([(400, 600)]))["silence"]
 
 
 @pytest.mark.parametrize("n_bursts", [1, 2, 3, 5, 20])

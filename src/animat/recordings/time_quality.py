@@ -40,6 +40,8 @@ LATE_SHARE, LATE_SPIKES = 0.1, 20
 """Smallest share of the recording, as less hardly changes rates; and fewest spikes, as fewer are not conclusive."""
 SILENT_SHARES, SILENT_S, SILENT_SPIKES = (0.01, 0.5), 1.0, 1000
 """Likewise for silences, from the first spike on; a culture that is silent most of the time fires in bursts."""
+LONGEST_BURST_S = 10.0
+"""If it is not silent for longer than this between long silences, these are not between bursts."""
 SILENCES = 5
 """Most silences that are reported together."""
 
@@ -238,11 +240,14 @@ def silences(recording: Recording) -> Iterator[Finding]:
     stands_out = (of_longest_s[:-1] > TIMES * of_longest_s[1:]) & (of_longest_s[:-1] > max(least_s, SILENT_S))
     n = int(np.max(np.flatnonzero(stands_out), initial=-1)) + 1
     total_s = float(of_longest_s[:n].sum())
-    if not 0 < total_s < most_s:
+    active_s = float(length_s.sum()) - total_s
+    if total_s == 0 or (total_s >= most_s and active_s < n * LONGEST_BURST_S):
         return
+    ended = ", or did it end earlier than stated" if longest[:n].max() == len(length_s) - 1 else ""
     where = ", ".join(f"from {times_s[i]:.12g} to {times_s[i + 1]:.12g} s" for i in sorted(longest[:n].tolist()))
     message = (
         f"no spike on any channel {where} ({total_s:.3g} s), while no other silence is longer than "
-        f"{of_longest_s[n]:.2g} s: was recording interrupted? If so, cut the recording there, as it counts in rates"
+        f"{of_longest_s[n]:.2g} s: was recording interrupted{ended}? If so, cut the recording there, as it counts in "
+        "rates"
     )
     yield Finding("silence", "warning", message, total_s)
