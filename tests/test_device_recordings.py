@@ -12,7 +12,8 @@ import pytest
 from animat.cultures.base import Culture
 from animat.cultures.devices.cl1 import CL1_PULSE, CL1Culture
 from animat.cultures.series import record_series
-from animat.errors import DeviceFailed
+from animat.errors import DeviceFailed, InvalidFile
+from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.reading import read_recording, read_recordings
 from animat.recordings.recording import Recording
 from animat.stimulation.protocol import Protocol
@@ -122,3 +123,27 @@ def test_what_was_recorded_before_an_error_is_kept(
     series = record_series(lambda: culture, protocol, tmp_path, sessions=1, interval_min=5.0)
     assert [len(recording.stimuli) for recording in read_recordings([tmp_path])] == [2000]
     assert len(series.files) == 1 and not list(tmp_path.glob(".*"))
+
+
+def test_a_recording_whose_file_cannot_be_written_is_kept_elsewhere(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    culture, *_ = on_maxone(monkeypatch)
+    protocol = Protocol(**vars(MIXED) | {"pulse": BALANCED_PULSE, "trials": 20})
+    (tmp_path / "elsewhere").mkdir()
+
+    def fill(recording: Recording, file: Path) -> None:
+        raise InvalidFile(f"{file}: No space left on device")
+
+    def full(recording: Recording, file: Path) -> None:
+        # Elsewhere there is room.
+        (fill if tmp_path / "elsewhere" not in file.parents else write_nwb)(recording, file)
+
+    monkeypatch.setattr("animat.cultures.series.write_nwb", fill)
+    monkeypatch.setattr("animat.cultures.under_way.write_nwb", full)
+    monkeypatch.setattr("animat.cultures.under_way.mkdtemp", lambda prefix: str(tmp_path / "elsewhere"))
+    with pytest.raises(InvalidFile, match="No space") as raised:
+        record_series(lambda: culture, protocol, tmp_path / "recordings", sessions=1)
+    (file,) = (tmp_path / "elsewhere").rglob("*.nwb")
+    assert str(file) in raised.value.__notes__[0] and len(read_recording(file).stimuli) == 100
+    assert not (tmp_path / "recordings" / "interrupted").exists()

@@ -314,6 +314,32 @@ def test_times_with_few_decimals_are_coarse(decimals: int, is_coarse: bool) -> N
     assert ("coarse-times" in findings(rounded)) == is_coarse
 
 
+@pytest.mark.parametrize(("decimals", "is_coarse"), [(4, False), (3, False), (2, True)])
+def test_rounded_stimulus_times_are_coarse_where_their_frequencies_show_it(decimals: int, is_coarse: bool) -> None:
+    rng = np.random.default_rng(1)
+    frequency_hz = rng.permutation(np.repeat([5.0, 80.0], 200))
+    time_s = np.round(1 + np.cumsum(1 / frequency_hz), decimals)
+    source = recording([(t, 0) for t in rng.uniform(0, 45, 2000)], time_s, 4, 46.0, frequency_hz=frequency_hz)
+    found = findings(source)
+    assert ("coarse-times" in found) == is_coarse
+    if is_coarse:
+        assert "steps of 10 ms, although those at 80 Hz are 12.5 ms apart" in found["coarse-times"].message
+    # Trains that are presented every second, or only at 5 Hz, do come in steps.
+    for hz, interval_s in ((80.0, 1.0), (5.0, 0.2)):
+        time_s, spikes = 1 + interval_s * np.arange(40), [(t, 0) for t in rng.uniform(0, 45, 2000)]
+        regular = recording(spikes, time_s, 4, 46.0, frequency_hz=np.full(40, hz))
+        assert "coarse-times" not in findings(regular)
+
+
+@pytest.mark.parametrize(("unit", "is_wrong"), [(1.0, False), (1e-3, True), (1e3, True), (0.0, True)])
+def test_positions_in_another_unit_cause_a_warning(unit: float, is_wrong: bool) -> None:
+    source = recording([(t, c) for t in range(1, 20) for c in range(16)], np.arange(1.0, 19.0), 16, 30.0)
+    x_um, y_um = np.divmod(np.arange(16), 4)
+    channels = replace(source.channels, x_um=unit * 100.0 * x_um, y_um=unit * 100.0 * y_um)
+    found = {each.name for each in recording_findings(replace(source, channels=channels))}
+    assert ("positions-not-in-um" in found) == is_wrong
+
+
 def test_a_single_unit_that_is_refractory_has_no_coarse_times() -> None:
     rng = np.random.default_rng(0)
     times_s = np.cumsum(0.004 + rng.exponential(0.2, 2000))

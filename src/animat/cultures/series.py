@@ -135,10 +135,10 @@ def record_series(
             expect_writable(folder, room_bytes=room_bytes)
             part = Part(progress, session, 1, sessions, file.name)
             recording = culture.record(protocol, order_seed(seed, session), part, follow)
-            # Its room is needed for the recording.
-            follow.remove()
+            follow.complete(recording)
             if not file.exists():
                 write_nwb(recording, file)
+                follow.written()
             elif not read_recording(file).equals(recording):
                 remedy = "remove it, or choose another folder"
                 raise Mismatch(f"{file}: expected the same as when recorded again, got another recording: {remedy}")
@@ -233,14 +233,14 @@ def _start_s(made: Mapping[int, Path], culture: Culture, protocol: Protocol, int
         if zero_s is None:
             zero_s = 60 * recording.start_min - session * interval_s
         since_s = culture.now_s - 60 * recording.start_min
+        if since_s < recording.duration_s:
+            at = f"{culture.now_s / 60:.2f} min, got one at {recording.start_min:.2f} min"
+            raise _another(file, f"before the culture's clock, which is at {at}: it was restarted, or is another's")
         if culture.device is not None and recording.recorded_at is not None:
             passed_s = (datetime.now(UTC) - recording.recorded_at).total_seconds()
             if passed_s > since_s + 60 * RESTARTED_MIN:
                 passed = f"{since_s / 60:.0f} min ago by the culture's clock, got one of {passed_s / 60:.0f} min ago"
                 raise _another(file, f"{passed} by its date: the clock was restarted")
-        if since_s < recording.duration_s:
-            at = f"{culture.now_s / 60:.2f} min, got one at {recording.start_min:.2f} min"
-            raise _another(file, f"before the culture's clock, which is at {at}: it was restarted, or is another's")
     return culture.now_s if zero_s is None else zero_s
 
 

@@ -6,11 +6,11 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
+from tempfile import mkdtemp
 from typing import Self
 
 import numpy as np
 
-from animat.cultures.failures import describe_error
 from animat.errors import counted
 from animat.recordings.columns import columns_of
 from animat.recordings.formats.nwb import recording_name, write_nwb
@@ -28,8 +28,8 @@ INTERRUPTED = "interrupted"
 class PartialRecording:
     """A `follow` function for `Culture.record`; a context manager that removes the file at the end.
 
-    If an error or Ctrl-C ends a recording of a device, which cannot be repeated, the part so far is written into the
-    folder `interrupted`.
+    What there is of a recording of a device, which cannot be repeated, when an error or Ctrl-C ends it before it is
+    `written`, goes into the folder `interrupted`, or else into a temporary one.
 
     Args:
         folder: of the series.
@@ -56,17 +56,30 @@ class PartialRecording:
         self._written_s = time.monotonic()
 
     def __exit__(self, _: object, error: BaseException | None, *rest: object) -> None:
-        so_far = self._so_far
         self.remove()
-        if error is not None and so_far is not None and self._is_kept:
-            try:
-                error.add_note(_keep(so_far(), self._path.parent / INTERRUPTED))
-            except Exception as failed:
-                error.add_note(f"and then: the recording so far could not be kept: {describe_error(failed)}")
+        if error is None or self._so_far is None or not self._is_kept:
+            return
+        recording = self._so_far()
+        with suppress(Exception):
+            error.add_note(_keep(recording, self._path.parent / INTERRUPTED))
+            return
+        # A full disk may be why.
+        with suppress(Exception):
+            error.add_note(_keep(recording, Path(mkdtemp(prefix="animat-"))))
+            return
+        error.add_note("and then: what was recorded so far could not be kept")
+
+    def complete(self, recording: Recording) -> None:
+        """Note that this is all, and leave the room on the disk to it."""
+        self._so_far = lambda: recording
+        self.remove()
+
+    def written(self) -> None:
+        """Note that the recording is in its file."""
+        self._so_far = None
 
     def remove(self) -> None:
-        """Remove the file, at the end of its recording, and the remains of killed runs."""
-        self._so_far = None
+        """Remove the file, and the remains of killed runs."""
         clear_away(self._path)
         clear_leftovers(self._path.parent, UNDER_WAY)
 
@@ -77,6 +90,11 @@ def _keep(recording: Recording, folder: Path) -> str:
     taken = len(list(folder.glob(f"{name.stem}*")))
     file = folder / (f"{name.stem}_{taken + 1}{name.suffix}" if taken else name)
     folder.mkdir(exist_ok=True)
-    write_nwb(recording, file)
+    try:
+        write_nwb(recording, file)
+    except BaseException:
+        with suppress(OSError):
+            folder.rmdir()
+        raise
     stimuli = counted(len(recording.stimuli), "stimulus", "stimuli")
     return f"what was recorded so far, {recording.duration_s / 60:.1f} min with {stimuli}, is in {file}"

@@ -261,9 +261,9 @@ class _Run:
             seed = order_seed(self.training.seed, number)
             recording = record_within(self.account, self.culture, self.protocol, seed, progress, follow)
             file = folder / recording_name(round(recording.start_min, 3))
-            # Its room is needed for the recording.
-            follow.remove()
+            follow.complete(recording)
             write_nwb(recording, file)
+            follow.written()
         self.files.append(file)
         self.keep_state()
         try:

@@ -26,6 +26,8 @@ PARTS, STEADY, STOPPED_PARTS, STOPPED_S = 20, 0.9, 5, 60.0
 """A channel has stopped if it fired in this share of a recording's parts, or more, up to its last spike, and is then
 silent for so many parts and seconds; by chance hardly one of 10,000 does."""
 STOPPED_SHARE = 0.05
+PITCH_UM = 2.0, 20_000.0
+"""Between these is the distance of neighbouring electrodes of all arrays, with a wide margin."""
 
 
 def recording_findings(recording: Recording | ResponseTable) -> tuple[Finding, ...]:
@@ -117,6 +119,23 @@ def _on_channels(recording: Recording) -> Iterator[Finding]:
         message = f"channels that fire as no neuron does: {which}; {remedy}"
         yield Finding("noisy-channels", "warning" if share > 0.1 else "note", message, float(len(noisy)))
     yield from _stopped_channels(recording)
+    yield from _positions(recording)
+
+
+def _positions(recording: Recording) -> Iterator[Finding]:
+    """A finding on positions between which no array has its electrodes."""
+    channels = recording.channels
+    x_um, y_um = (axis[~np.isnan(axis)] for axis in (channels.x_um, channels.y_um))
+    if len(x_um) < SEVERAL or len(x_um) != len(y_um):
+        return
+    area_um2 = float(np.ptp(x_um) * np.ptp(y_um)) or max(np.ptp(x_um), np.ptp(y_um)) ** 2
+    apart_um = (area_um2 / len(x_um)) ** 0.5
+    if not PITCH_UM[0] < apart_um < PITCH_UM[1]:
+        message = (
+            f"{len(x_um):,} electrodes in {np.ptp(x_um):.3g} um x {np.ptp(y_um):.3g} um would be {apart_um:.2g} um "
+            "apart: provide their positions in micrometres"
+        )
+        yield Finding("positions-not-in-um", "warning", message, apart_um)
 
 
 def _stopped_channels(recording: Recording) -> Iterator[Finding]:

@@ -89,7 +89,12 @@ class TextTable:
 
     def note_left_out(self, missing: Sequence[str]) -> None:
         """Add a finding on columns that were not looked up, which may be one of the missing, misspelt."""
-        left_out = [name for column, name in enumerate(self.header) if column not in self.used]
+        # A line that ends with a separator has an empty column there.
+        left_out = [
+            name
+            for column, name in enumerate(self.header)
+            if column not in self.used and (name or any(row[column] for row in self.rows))
+        ]
         self.findings.extend(left_out_findings("columns", left_out, self.path.name, missing))
 
     def _note_once(self, name: str, message: str) -> None:

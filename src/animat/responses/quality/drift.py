@@ -15,6 +15,7 @@ LARGE = 0.25
 """Change over the recording, relative to the mean response, above which there is a warning."""
 CERTAIN = 4.0
 """Standard errors by which the change must differ from 0."""
+_MOST = 2.0
 FEWEST = 20
 NEWEST = 3
 """Recordings from which the drift between them is estimated: it slows down over hours."""
@@ -53,9 +54,11 @@ def drift_findings(responses: Responses) -> Iterator[Finding]:
     if abs(slope) <= CERTAIN * error:
         return
     span = "in the order of the rows" if responses.time_s is None else f"recording: {np.ptp(time_s) / 60:.1f} min"
+    # A line through responses, which are not below 0, changes by no more; they stop, say, instead.
+    by = f"{100 * abs(slope):.0f} % of their mean (+- {100 * error:.0f} %)"
+    by = by if abs(slope) <= _MOST else f"more than {100 * _MOST:.0f} % of their mean, as if they stopped or began"
     message = (
-        f"responses {'rise' if slope > 0 else 'fall'} by {100 * abs(slope):.0f} % of their mean "
-        f"(+- {100 * error:.0f} %) from a condition's first stimuli to its last ({span})"
+        f"responses {'rise' if slope > 0 else 'fall'} by {by} from a condition's first stimuli to its last ({span})"
     )
     large = abs(slope) > LARGE
     if large:

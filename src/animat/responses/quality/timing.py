@@ -34,6 +34,8 @@ COARSE = 0.25
 ENOUGH_SPIKES, ENOUGH_STEPS = 1000, 20
 WHOLE, NEARLY_ALL = 0.01, 0.99
 """How close intervals must be to a whole number of steps, and the share of intervals that must be."""
+AGREE = 0.05
+"""How well the mean of rounded intervals must agree with the stated one."""
 
 
 def artefact_findings(recording: Recording, window_ms: Window, *, is_elsewhere: bool = False) -> Iterator[Finding]:
@@ -79,7 +81,8 @@ def artefact_findings(recording: Recording, window_ms: Window, *, is_elsewhere: 
             begin = "" if is_elsewhere else f": begin it at {to_ms:g} ms or later (--window-ms)"
             remedy = f"the window begins at {window_ms[0]:g} ms, inside it{begin}"
         message = (
-            f"from {from_ms:g} to {to_ms:g} ms there are {spikes / n_stimuli:.1f} spikes per stimulus, "
+            f"from {from_ms:g} to {to_ms:g} ms there are {spikes / n_stimuli:.1f} spikes per stimulus"
+            f"{' (of those well apart)' if chosen is apart and n_stimuli < read.sum() else ''}, "
             f"{spikes / (usual * artefact.sum()):.3g} times as many as is usual in as much time: an artefact counted "
             f"as spikes{'' if from_ms < 0 else ', or neurons fired directly by the pulse'} "
             f"({100 * every_pulse / len(recording.spike_times_s):.1f} % of all); {remedy}"
@@ -160,11 +163,13 @@ def _blank(
 
 
 def resolution_findings(recording: Recording, window_ms: Window) -> Iterator[Finding]:
-    """A finding on spike times that come in steps of more than a quarter of the window (`coarse-times`).
+    """Findings on times that come in steps of more than a quarter of the window (`coarse-times`).
 
-    The step is the shortest interval between different spike times, if nearly all intervals are whole multiples of it.
-    Only the later half is examined, as times in single precision grow coarser.
+    Of spikes, the step is the shortest interval between different times, if nearly all intervals are whole multiples of
+    it. Only the later half is examined, as times in single precision grow coarser. Stimuli may come in equal steps
+    anyway: theirs are coarse if they are 1/f apart for their stated frequency f, but rounded.
     """
+    yield from _rounded_stimuli(recording, window_ms)
     time_s = np.unique(recording.spike_times_s[len(recording.spike_times_s) // 2 :])
     if len(recording.spike_times_s) < ENOUGH_SPIKES or len(time_s) <= ENOUGH_STEPS:
         return
@@ -180,3 +185,26 @@ def resolution_findings(recording: Recording, window_ms: Window) -> Iterator[Fin
         "it holds is chance; supply times in double precision (float64, more decimals), or use a longer window"
     )
     yield Finding("coarse-times", "warning", message, 1e3 * step_s)
+
+
+def _rounded_stimuli(recording: Recording, window_ms: Window) -> Iterator[Finding]:
+    time_s, frequency_hz = recording.stimuli.time_s, recording.stimuli.frequency_hz
+    width_ms = window_ms[1] - window_ms[0]
+    for step_s in (1.0, 0.1, 0.01, 0.001):
+        steps = time_s / step_s
+        if 1e3 * step_s <= COARSE * width_ms or np.any(np.abs(steps - np.rint(steps)) > 1e-6):
+            continue
+        for stated_hz in np.unique(frequency_hz[frequency_hz > 0]).tolist():
+            interval = np.diff(steps)[frequency_hz[1:] == stated_hz]
+            stated = 1 / stated_hz / step_s
+            if len(interval) < ENOUGH_STEPS or abs(stated - round(stated)) <= WHOLE:
+                continue
+            is_near = np.mean(np.abs(interval - stated) < 1) > NEARLY_ALL
+            if is_near and abs(np.mean(interval) / stated - 1) < AGREE:
+                message = (
+                    f"stimulus times come in steps of {1e3 * step_s:g} ms, although those at {stated_hz:g} Hz are "
+                    f"{1e3 / stated_hz:.3g} ms apart: they are rounded, too coarse for a window of {width_ms:g} ms; "
+                    "supply them with more decimals"
+                )
+                yield Finding("coarse-times", "warning", message, 1e3 * step_s)
+                return
