@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from animat.cli import main
 from animat.cultures.base import Culture
 from animat.cultures.devices.cl1 import CL1_PULSE, CL1Culture
 from animat.cultures.series import record_series
@@ -81,10 +82,11 @@ def test_a_long_block_is_recorded_in_stretches_and_the_clock_keeps_count(
     came_s = np.unique(recording.spike_times_s)
     expected_s = recording.stimuli.time_s[answered] + answer_s
     assert np.all(np.abs(came_s[np.searchsorted(came_s, expected_s - 1e-6)] - expected_s) < 1.5 / rate_hz)
-    left_out = recording.provenance.get("left_out", "")
-    assert ("ms between stretches" in left_out) == (between_s > 0)
+    found = {finding.name: finding for finding in recording.findings}
+    assert ("left-out" in found) == (between_s > 0)
     if between_s:
-        assert f"{2000 * between_s:.0f} ms between stretches" in left_out
+        assert found["left-out"].severity == "note"
+        assert f"lacks: {2000 * between_s:.0f} ms between stretches" in found["left-out"].message
 
 
 @pytest.mark.parametrize("device", [on_cl1, on_maxone])
@@ -147,3 +149,51 @@ def test_a_recording_whose_file_cannot_be_written_is_kept_elsewhere(
     (file,) = (tmp_path / "elsewhere").rglob("*.nwb")
     assert str(file) in raised.value.__notes__[0] and len(read_recording(file).stimuli) == 100
     assert not (tmp_path / "recordings" / "interrupted").exists()
+
+
+def test_record_says_what_it_will_deliver_and_what_came_late(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    neurons = install_cl(monkeypatch)
+    protocol = tmp_path / "few.json"
+    protocol.write_text('{"trials": 10, "frequencies_hz": [10, 40]}')
+    record = ["record", "--culture", "cl1", "--protocol", str(protocol), "--sessions", "1"]
+    assert main([*record, "--out", str(tmp_path / "punctual")]) == 0
+    said = capsys.readouterr().err
+    assert "1 recording of 0.3 min, with 20 stimuli each; each pulse: -1 uA" in said and "later" not in said
+    # The computer is 50 ms behind the device: of stimuli 25 ms apart each is late.
+    neurons.late_frames = 1250 + 2500
+    assert main([*record, "--out", str(tmp_path / "late")]) == 0
+    said = capsys.readouterr().err
+    (finding,) = read_recording(tmp_path / "late" / "recording_0000_min.nwb").findings
+    frames = np.array(sorted({frame for frame, *_ in neurons.pulses}))[20:]
+    with CL1Culture() as culture:
+        (block,) = culture.schedule(Protocol(trials=10, frequencies_hz=(10, 40), order="mixed"), 10_000).blocks
+    later = np.diff(frames) / 25_000 - np.diff(block.stimuli.time_s) > 0.001
+    assert finding.name == "late-stimuli" and finding.value == pytest.approx((1 + later.sum()) / 20, abs=0.06)
+    assert f"recording_0000_min.nwb: {finding.severity}: {finding.message}" in said
+
+
+def test_frames_that_a_device_lost_are_a_finding(monkeypatch: pytest.MonkeyPatch) -> None:
+    culture, *_ = on_maxone(monkeypatch)
+    protocol = Protocol(**vars(MIXED) | {"pulse": BALANCED_PULSE, "trials": 20})
+    lost = {"frames lost on the way": 0}
+    monkeypatch.setattr(type(culture), "left_out", property(lambda _: dict(lost)))
+    for more, severity in ((0, None), (100, "note"), (30_000, "warning")):
+        with culture:
+            before, deliver = lost["frames lost on the way"], type(culture)._deliver
+
+            def lose(self: Culture, admitted: object, duration_s: float, more: int = more) -> object:
+                lost["frames lost on the way"] += more
+                return deliver(self, admitted, duration_s)  # type: ignore[arg-type]
+
+            with monkeypatch.context() as patch:
+                patch.setattr(type(culture), "_deliver", lose)
+                recording = culture.record(protocol, 1)
+        found = {finding.name: finding for finding in recording.findings}
+        assert (found["left-out"].severity if severity else None) == severity
+        if severity:
+            assert f"{more:,} frames lost on the way" in found["left-out"].message
+            assert (
+                recording.provenance["left_out"] == f"{lost['frames lost on the way'] - before} frames lost on the way"
+            )

@@ -12,6 +12,7 @@ from animat.errors import InvalidArgument, Mismatch, counted, in_min, some_of
 from animat.folders import expect_no_other
 
 if TYPE_CHECKING:
+    from animat.cultures.base import Culture
     from animat.stimulation.protocol import Protocol
 
 
@@ -58,7 +59,7 @@ class Record(FolderCommand):
         from animat.cultures.kinds import culture_of
         from animat.cultures.series import record_series
         from animat.progress import Bar
-        from animat.recordings.reading import read_recordings
+        from animat.recordings.reading import read_recording, read_recordings
 
         # Before any device is powered.
         for option, some, kind, value in (
@@ -86,14 +87,21 @@ class Record(FolderCommand):
         before = set(self.out.glob("*"))
         with Bar("recording") as progress:
             recordings = read_recordings(self.recordings) if self.recordings else []
+            sessions = (15 if self.paper else 2) if self.sessions is None else self.sessions
+
+            def planned(culture: Culture) -> Protocol:
+                protocol = self._protocol(len(culture.patterns))
+                print(_plan(protocol, sessions, self.interval_min), file=sys.stderr)
+                return protocol
+
             series = record_series(
                 lambda: culture_of(
                     self.culture, seed=self.seed, recordings=recordings, selection=self.selection, progress=progress
                 ),
                 # A virtual culture has the usual number of patterns.
-                protocol if self.culture == "virtual" else lambda culture: self._protocol(len(culture.patterns)),
+                protocol if self.culture == "virtual" else planned,
                 self.out,
-                sessions=(15 if self.paper else 2) if self.sessions is None else self.sessions,
+                sessions=sessions,
                 interval_min=self.interval_min,
                 seed=self.seed,
                 progress=progress,
@@ -101,6 +109,10 @@ class Record(FolderCommand):
             for minute in series.missed_min:
                 print(f"missed: the recording at {in_min(minute)} was not made, as the next was due", file=sys.stderr)
         files = series.files
+        for file in files if self.culture in ("cl1", "maxone") else ():
+            if file not in before:
+                for finding in read_recording(file).findings:
+                    print(f"{file.name}: {finding.severity}: {finding.message}", file=sys.stderr)
         existed = "; all existed already" if files and before.issuperset(self.out.glob("*")) else ""
         print(f"{counted(len(files), 'recording')} in {self.out}{existed}")
         if protocol.places:
@@ -135,6 +147,17 @@ def _expect_no_others(folder: Path) -> None:
     if others:
         got = some_of(others, 3)
         raise Mismatch(f"{folder}: expected only recordings of this series, got {got}; choose another --out")
+
+
+def _plan(protocol: Protocol, sessions: int, interval_min: float) -> str:
+    """What a device is about to deliver, in a line."""
+    from animat.cultures.series import minutes_of
+
+    pulses = len(protocol.frequencies_hz) * protocol.trials * protocol.pulses * max(1, protocol.n_places)
+    series = f"{counted(sessions, 'recording')} of {minutes_of(protocol):.1f} min"
+    if sessions > 1:
+        series += f", one every {interval_min:g} min"
+    return f"{series}, with {counted(pulses, 'stimulus', 'stimuli')} each; each pulse: {protocol.pulse}"
 
 
 def _warn_too_fast(protocol: Protocol) -> None:

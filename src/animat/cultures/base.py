@@ -20,6 +20,7 @@ from animat.cultures.limits import Limits
 from animat.cultures.observed import Observed, Spikes, assemble, following, with_rests
 from animat.cultures.openable import Openable
 from animat.cultures.safety import SIMULATED_LIMITS, Admitted
+from animat.cultures.shortfalls import shortfalls
 from animat.errors import AnimatError, InvalidArgument, expect_kind, some_of
 from animat.progress import Progress, Silent
 from animat.recordings.recorded_culture import RecordedCulture
@@ -221,8 +222,8 @@ class Culture(Openable):
 
         The whole schedule is checked before anything is delivered. Set-up times pass unobserved and are left out of the
         recording's clock, on which blocks follow one another directly. The clock of a device runs on between two
-        stretches of a block: the next one makes up for it as far as it can, and the recording counts the time in which
-        nothing was observed among what it left out.
+        stretches of a block: the next one makes up for it as far as it can, and a finding of the recording (`left-out`)
+        has the time in which nothing was observed.
 
         Args:
             protocol: what to do; it is kept with the recording.
@@ -241,16 +242,21 @@ class Culture(Openable):
         if date is not None:
             provenance["recorded_at"] = date.isoformat()
         self._rehearse(schedule)
-        about = {"channels": self.channels, "culture": self.recorded_as, "provenance": provenance, "recorded_at": date}
+        about = {"channels": self.channels, "culture": self.recorded_as, "recorded_at": date}
         start_min, rate_hz, before = self.now_s / 60, self.sampling_rate_hz, self.left_out
         parts = list[tuple[Block, Observed]]()
+        followed_s = unobserved_s = 0.0
 
         def so_far() -> Recording:
             blocks, observed = zip(*parts, strict=True)
-            recorded = replace(schedule, blocks=blocks)
-            return assemble(recorded, observed, sampling_rate_hz=rate_hz, start_min=start_min, **about)
+            left_out = Counter(self.left_out) - Counter(before)
+            findings = tuple(shortfalls(parts, left_out, unobserved_s, rate_hz))
+            lacks = {"left_out": ", ".join(f"{n} {what}" for what, n in left_out.items())} if left_out else {}
+            recorded = assemble(
+                replace(schedule, blocks=blocks), observed, sampling_rate_hz=rate_hz, start_min=start_min, **about
+            )
+            return replace(recorded, provenance={**provenance, **lacks}, findings=findings)
 
-        followed_s = unobserved_s = 0.0
         # A clock that stands still between calls needs no gap to make up for.
         gap_s = SHORTEST_GAP_S if self.device is None else _GAP_ON_DEVICE_S
         for done, block in enumerate(schedule.blocks):
@@ -270,11 +276,6 @@ class Culture(Openable):
                     seen_s = self.now_s
                     follow(so_far)
                     followed_s = self.now_s - seen_s
-        more = [f"{count} {what}" for what, count in (Counter(self.left_out) - Counter(before)).items()]
-        if unobserved_s:
-            more.append(f"{1000 * unobserved_s:.0f} ms between stretches")
-        if more:
-            provenance["left_out"] = ", ".join(more)
         return so_far()
 
     def _rehearse(self, schedule: Schedule) -> None:
