@@ -89,9 +89,12 @@ class Record(FolderCommand):
             recordings = read_recordings(self.recordings) if self.recordings else []
             sessions = (15 if self.paper else 2) if self.sessions is None else self.sessions
 
+            is_device = self.culture in ("cl1", "maxone")
+
             def planned(culture: Culture) -> Protocol:
                 protocol = self._protocol(len(culture.patterns))
-                print(_plan(protocol, sessions, self.interval_min), file=sys.stderr)
+                if is_device:
+                    print(_plan(protocol, sessions, self.interval_min), file=sys.stderr)
                 return protocol
 
             series = record_series(
@@ -106,10 +109,11 @@ class Record(FolderCommand):
                 seed=self.seed,
                 progress=progress,
             )
-            for minute in series.missed_min:
-                print(f"missed: the recording at {in_min(minute)} was not made, as the next was due", file=sys.stderr)
+            if missed := [in_min(minute) for minute in series.missed_min]:
+                at = f"{counted(len(missed), 'recording')} not made, as the next was due: at {some_of(missed)}"
+                print(f"missed: {at}", file=sys.stderr)
         files = series.files
-        for file in files if self.culture in ("cl1", "maxone") else ():
+        for file in files if is_device else ():
             if file not in before:
                 for finding in read_recording(file).findings:
                     print(f"{file.name}: {finding.severity}: {finding.message}", file=sys.stderr)
