@@ -13,6 +13,7 @@ from animat.cli import main
 from animat.cultures.base import Culture
 from animat.cultures.devices.cl1 import CL1_PULSE, CL1Culture
 from animat.cultures.series import record_series
+from animat.cultures.under_way import UNDER_WAY, PartialRecording
 from animat.errors import DeviceFailed, InvalidFile
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.reading import read_recording, read_recordings
@@ -195,3 +196,18 @@ def test_frames_that_a_device_lost_are_a_finding(monkeypatch: pytest.MonkeyPatch
         if severity is not None:
             assert f"lacks: {n:,} frames lost on the way" in found["left-out"].message
             assert recording.provenance["left_out"] == f"{n} frames lost on the way"
+
+
+def test_what_a_killed_run_left_is_kept_by_the_next(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    culture, *_ = on_maxone(monkeypatch)
+    protocol = Protocol(**vars(MIXED) | {"pulse": BALANCED_PULSE, "trials": 20})
+    with culture:
+        recording = culture.record(protocol, 1)
+    # As a killed run leaves it.
+    PartialRecording(tmp_path)(lambda: recording)
+    assert (tmp_path / UNDER_WAY).exists()
+    record_series(lambda: on_maxone(monkeypatch)[0], protocol, tmp_path, sessions=1)
+    kept = read_recording(tmp_path / "interrupted" / "recording_0000_min.nwb")
+    assert kept.spike_times_s.tolist() == recording.spike_times_s.tolist()
+    assert kept.stimuli.electrodes.tolist() == recording.stimuli.electrodes.tolist()
+    assert not list(tmp_path.glob(".*"))

@@ -111,7 +111,7 @@ class Record(FolderCommand):
             )
             if missed := [in_min(minute) for minute in series.missed_min]:
                 at = f"{counted(len(missed), 'recording')} not made, as the next was due: at {some_of(missed)}"
-                print(f"missed: {at}", file=sys.stderr)
+                print(f"missed: {at}; for others choose another --out", file=sys.stderr)
         files = series.files
         for file in files if is_device else ():
             if file not in before:

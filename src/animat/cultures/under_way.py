@@ -11,9 +11,10 @@ from typing import Self
 
 import numpy as np
 
-from animat.errors import counted
+from animat.errors import AnimatError, counted
 from animat.recordings.columns import columns_of
 from animat.recordings.formats.nwb import recording_name, write_nwb
+from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
 from animat.writing import atomic_write, clear_away, clear_leftovers
 
@@ -29,7 +30,7 @@ class PartialRecording:
     """A `follow` function for `Culture.record`; a context manager that removes the file at the end.
 
     What there is of a recording of a device, which cannot be repeated, when an error or Ctrl-C ends it before it is
-    `written`, goes into the folder `interrupted`, or else into a temporary one.
+    `written`, goes into the folder `interrupted`, or else into a temporary one; after a kill, when the next run begins.
 
     Args:
         folder: of the series.
@@ -42,6 +43,10 @@ class PartialRecording:
         self._so_far: Callable[[], Recording] | None = None
 
     def __enter__(self) -> Self:
+        if self._is_kept and self._path.exists():
+            # That of a run that was killed.
+            with suppress(AnimatError):
+                _keep(read_recording(self._path), self._path.parent / INTERRUPTED)
         self.remove()
         return self
 
