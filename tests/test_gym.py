@@ -555,3 +555,16 @@ def test_without_a_render_mode_a_picture_is_refused_with_a_warning() -> None:
     env.reset(seed=0)
     with pytest.warns(UserWarning, match="render_mode"):
         assert env.render() is None
+
+
+def test_pictures_come_as_fast_as_the_robot_moves() -> None:
+    assert gymnasium.make("Animat/SwingUp-v0").metadata["render_fps"] == 20
+    assert gymnasium.make("Animat/SwingUp-v0", step_s=0.1).metadata["render_fps"] == 10
+    assert gymnasium.make("Animat/Cartpole-v0").metadata["render_fps"] == 50
+    assert gymnasium.make_vec("Animat/SwingUp-v0", 2).metadata["render_fps"] == 20
+    assert gymnasium.make("Animat/Cartpole-v0").metadata["render_fps"] == 50
+
+
+def test_a_limit_by_another_name_is_refused_with_ours() -> None:
+    with pytest.raises(InvalidArgument, match="'max_episode_steps': the robot's own is episode_limit"):
+        gymnasium.make_vec("Animat/Cartpole-v0", 2, max_episode_steps=4)

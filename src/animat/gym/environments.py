@@ -21,6 +21,7 @@ from jaxtyping import Array, Bool, Float32, Int64, UInt8, UInt32
 
 from animat.environment import Environment, State
 from animat.errors import InvalidArgument, expect_at_least, expect_kind, shown
+from animat.goals.robot import without_goal
 from animat.gym.setup import set_up
 from animat.robots.base import capability
 from animat.robots.drawing import draw_robot
@@ -41,6 +42,7 @@ class CompiledAnimats:
         InvalidArgument: as `set_up` does, for an unknown render mode, or `rgb_array` for a robot that cannot be drawn.
     """
 
+    metadata: dict[str, Any]
     render_mode: str | None
 
     def __init__(self, n: int, robot: str, render_mode: str | None, options: dict[str, Any]) -> None:
@@ -51,6 +53,9 @@ class CompiledAnimats:
         if render_mode is not None:
             capability(self.setup.environment.robot, "draw")
         self.render_mode = render_mode
+        if (step_s := getattr(without_goal(self.setup.environment.robot), "step_s", None)) is not None:
+            # Films are then in real time.
+            self.metadata = {**self.metadata, "render_fps": round(1 / step_s)}
         self._rows: Rows | None = None
         self._shown: list[list[Float32[np.ndarray, " observations"]]] = [[] for _ in range(n)]
         self._commands: Float32[np.ndarray, "environments *commands"]

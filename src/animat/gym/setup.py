@@ -112,6 +112,8 @@ def set_up(
         # A misspelt option is taken for a parameter of the robot.
         named = [name for name in parameters if str(error).endswith(repr(name))]
         hint = did_you_mean(named[0], signature(set_up).parameters) if named else ""
+        if "max_episode_steps" in named:
+            hint = ": the robot's own is episode_limit"
         raise InvalidArgument(f"{error}{hint}") from None
     if isinstance(body, HostRobot):
         raise InvalidArgument(
