@@ -26,6 +26,7 @@ from animat.responses.responses import Responses
 from animat.training.policy import Policy
 from rig_files import mapping_table, spike_table, write_cl1, write_maxwell
 from synthetic_recordings import synthetic_recording
+from test_responses import recording
 from test_run_on_recordings import FIVE_HZ, policy_of
 
 RIGS = [
@@ -232,3 +233,15 @@ def test_a_policy_knows_its_culture_and_another_one_is_reported(tmp_path: Path) 
     # Policies of earlier versions do not state it.
     assert said(replace(policy, provenance={})) == []
     assert not [each for each in timeline_differences(policy, of_c1) if each.name == "other-culture"]
+
+
+@pytest.mark.parametrize(("start_min", "over_s"), [(0.3, 12.0), (0.5, None), (10.0, None)])
+def test_recordings_that_overlap_in_time_cause_a_warning(start_min: float, over_s: float | None) -> None:
+    spikes = [(t + 0.005 + 0.0001 * i, i) for t in range(1, 29) for i in range(4)]
+    first = replace(recording(spikes, np.arange(1.0, 29.0), 4, 30.0), start_min=0.0)
+    series = extract_series([first, replace(first, start_min=start_min)])
+    found = {finding.name: finding for finding in series_findings(series)}
+    assert ("recordings-overlap" in found) == (over_s is not None)
+    if over_s is not None:
+        assert found["recordings-overlap"].value == pytest.approx(over_s)
+        assert "that at 0 min lasts 12 s longer than to the next, at 0.3 min" in found["recordings-overlap"].message

@@ -331,6 +331,24 @@ def test_rounded_stimulus_times_are_coarse_where_their_frequencies_show_it(decim
         assert "coarse-times" not in findings(regular)
 
 
+@pytest.mark.parametrize("stated", ["blocked", "mixed"])
+@pytest.mark.parametrize("order", ["blocked", "mixed"])
+def test_an_order_that_the_frequencies_contradict_causes_a_warning(stated: Order, order: Order) -> None:
+    frequency_hz = np.repeat([5.0, 10.0, 20.0], 40)
+    if order == "mixed":
+        frequency_hz = np.random.default_rng(1).permutation(frequency_hz)
+    source = recording([(1.0, 0)] * 200, 1 + np.cumsum(1 / frequency_hz), 4, 20.0, frequency_hz=frequency_hz)
+    found = {f.name for f in recording_findings(replace(source, presentation=Presentation(stated)))}
+    assert ("other-order" in found) == (stated != order)
+
+
+@pytest.mark.parametrize(("rate_hz", "is_wrong"), [(20_000.0, False), (20.0, True), (float("nan"), False)])
+def test_a_sampling_rate_in_khz_causes_a_warning(rate_hz: float, is_wrong: bool) -> None:
+    source = recording([(0.1 * t, 0) for t in range(1, 200)], np.arange(1.0, 19.0), 4, 30.0)
+    found = {f.name for f in recording_findings(replace(source, sampling_rate_hz=rate_hz))}
+    assert ("sampling-rate" in found) == is_wrong
+
+
 @pytest.mark.parametrize(("unit", "is_wrong"), [(1.0, False), (1e-3, True), (1e3, True), (0.0, True)])
 def test_positions_in_another_unit_cause_a_warning(unit: float, is_wrong: bool) -> None:
     source = recording([(t, c) for t in range(1, 20) for c in range(16)], np.arange(1.0, 19.0), 16, 30.0)

@@ -297,6 +297,13 @@ def test_cl1_spikes_and_stimuli_with_parameters_from_the_data_stream(tmp_path: P
     assert (recording.sampling_rate_hz, recording.duration_s) == (25_000.0, 10.0)
 
 
+def test_cl1_electrodes_of_a_stimulus_may_be_a_frame_or_two_apart(tmp_path: Path) -> None:
+    stims = [(1000, 9), (1001, 11), (1002, 20), (1005, 9), (2000, 30), (2000, 31)]
+    source = read_recording(write_cl1(tmp_path / "a.h5", spikes=[(1100, 9)], stims=stims))
+    assert (source.stimuli.time_s * 25_000).round().tolist() == [1000, 1005, 2000]
+    assert [{*row} - {-1} for row in source.stimuli.electrodes.tolist()] == [{9, 11, 20}, {9}, {30, 31}]
+
+
 def test_cl1_ground_and_reference_count_neither_in_files_nor_in_animats_own_recordings(tmp_path: Path) -> None:
     spikes = [(5, 1), (6, 0), (7, 4), (8, 63), (9, 63), (10, 62)]
     recording = read_recording(write_cl1(tmp_path / "a.h5", spikes=spikes, stims=[(1, 2)]))

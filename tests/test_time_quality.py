@@ -211,5 +211,11 @@ def test_frequencies_that_contradict_the_times_cause_a_warning() -> None:
     stimuli = synthetic_recording(1, start_min=0.0, patterns=25, channels=16).stimuli
     (mixed,) = frequency_findings(dataclasses.replace(stimuli, time_s=np.cumsum(mixed_s), frequency_hz=mixed_s))
     assert mixed.message.endswith(": these are periods in seconds: write 1 divided by each, here 40")
+    # Periods in milliseconds, of which the first way of counting finds no fault.
+    mixed_hz = np.random.default_rng(0).choice([5.0, 10.0, 20.0, 40.0], len(true_hz))
+    stimuli = dataclasses.replace(stimuli, time_s=np.cumsum(1 / mixed_hz), frequency_hz=1000 / mixed_hz)
+    (mixed,) = frequency_findings(stimuli)
+    assert mixed.message.endswith(": these are periods in milliseconds: write 1,000 divided by each, here 40")
+    assert not list(frequency_findings(dataclasses.replace(stimuli, frequency_hz=mixed_hz)))
     # Pauses between stimuli are none of a frequency's business.
     assert contradicted(np.full(len(true_hz), 80.0)) is None

@@ -11,11 +11,15 @@ import numpy as np
 import pytest
 
 from animat.cli import main
+from animat.evaluation.transfer import faster_than_recorded
 from animat.neurons.timeline import load_timeline
 from animat.progress import Silent
+from animat.recordings.findings import Finding
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.recording import Recording
-from animat.stimulation.protocol import Presentation
+from animat.responses.condition import Condition
+from animat.stimulation.protocol import Order, Presentation, Protocol
+from animat.stimulation.schedule import make_schedule
 from animat.studies.recording import Fit
 from animat.studies.specification import Simulators
 from animat.studies.toml import read_study
@@ -190,3 +194,21 @@ def test_the_papers_setting_is_one_word(tmp_path: Path, capsys: pytest.CaptureFi
 
     assert main(["record", "--paper", "--protocol", "x.json"]) == 1
     assert "--protocol, --paper: expected one of them, as each is a protocol, got both" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("order", ["blocked", "mixed"])
+def test_a_loop_that_is_faster_than_the_recording_is_reported(order: Order) -> None:
+    protocol = Protocol(frequencies_hz=(5, 10, 40), order=order, trials=40)
+    schedule = make_schedule(protocol, np.zeros((100, 1), np.int64), 1)
+    tables = [block.stimuli for block in schedule.blocks]
+    time_s = np.concatenate([300 * i + table.time_s for i, table in enumerate(tables)])
+    recorded = recording([(1.0, 0)] * 200, time_s, 4, 1000.0)
+
+    def reported(*frequencies_hz: float) -> list[Finding]:
+        conditions = [Condition(f"{hz} Hz", hz, "Hz") for hz in frequencies_hz]
+        return list(faster_than_recorded(recorded, conditions))
+
+    assert reported(5, 10, 40) == reported(5) == list(faster_than_recorded(None, [])) == []
+    (finding,) = reported(5, 200)
+    assert (finding.name, finding.value) == ("faster-than-recorded", pytest.approx(5.0))
+    assert "at up to 200 Hz, 5 ms apart" in finding.message and "less than 25 ms apart" in finding.message

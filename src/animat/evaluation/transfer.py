@@ -5,16 +5,21 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 from animat.errors import Mismatch, in_min, some_of
 from animat.neurons.timeline import SimulatorTimeline
 from animat.recordings.findings import Finding
 from animat.recordings.recorded_culture import RecordedCulture
+from animat.recordings.recording import Recording
 from animat.responses.condition import Condition, stimulus_mismatch
 from animat.responses.readouts import Readouts
 from animat.stimulation.protocol import Presentation
 from animat.training.policy import Policy
 
 UNKNOWN = "unknown-presentation"
+_RARELY, _FASTER = 0.01, 1.5
+"""Share of the intervals of a recording that may be shorter, and how many times as fast a loop may be."""
 OLD_MIN = 30.0
 """Age of a recording above which a warning says that the culture may have drifted."""
 
@@ -72,6 +77,21 @@ def other_culture(trained: RecordedCulture | None, given: RecordedCulture | None
             "culture responds differently"
         )
         yield Finding("other-culture", "warning", message)
+
+
+def faster_than_recorded(recording: Recording | None, conditions: Sequence[Condition]) -> Iterator[Finding]:
+    """A warning if a loop stimulates faster than the recording ever did, as where its frequencies are wrong."""
+    if recording is None or len(recording.stimuli) < 2:
+        return
+    # Not the very shortest, which may be a late pulse or a coarse time.
+    shortest_s = float(np.quantile(np.diff(recording.stimuli.time_s), _RARELY))
+    fastest_hz = max((hz for condition in conditions for hz in condition.frequencies_hz), default=0.0)
+    if fastest_hz * shortest_s > _FASTER:
+        message = (
+            f"the loop stimulates at up to {fastest_hz:g} Hz, {1000 / fastest_hz:.3g} ms apart, but in the recording "
+            f"stimuli were hardly ever less than {1000 * shortest_s:.3g} ms apart: check its frequencies"
+        )
+        yield Finding("faster-than-recorded", "warning", message, fastest_hz * shortest_s)
 
 
 def old_calibration(age_min: float, now: str) -> Iterator[Finding]:

@@ -265,6 +265,7 @@ def _warnings(
         yield Finding("moving-percentiles", "warning", message)
     yield from transfer.other_simulator(first.fitted, calibration.fitted)
     yield from transfer.other_culture(first.culture, calibration.culture)
+    yield from transfer.faster_than_recorded(calibration.recording, loop.conditions)
     yield from transfer.old_calibration(age_min, "this session")
     yield from transfer.no_memory(calibration.findings, calibration.presentation, has_memory=has_memory)
     if isinstance(loop.robot, HostRobot):

@@ -26,6 +26,8 @@ PARTS, STEADY, STOPPED_PARTS, STOPPED_S = 20, 0.9, 5, 60.0
 """A channel has stopped if it fired in this share of a recording's parts, or more, up to its last spike, and is then
 silent for so many parts and seconds; by chance hardly one of 10,000 does."""
 STOPPED_SHARE = 0.05
+SLOWEST_HZ = 1000.0
+"""A spike lasts a millisecond: no array is sampled more slowly."""
 PITCH_UM = 2.0, 20_000.0
 """Between these is the distance of neighbouring electrodes of all arrays, with a wide margin."""
 
@@ -53,6 +55,9 @@ def _in_data(recording: Recording) -> Iterable[Finding]:
         yield from _on_channels(recording)
     yield from time_findings(recording)
     yield from silences(recording)
+    if recording.sampling_rate_hz < SLOWEST_HZ:
+        message = f"no spikes can be detected at a sampling rate of {recording.sampling_rate_hz:g} Hz: is it in kHz?"
+        yield Finding("sampling-rate", "warning", message, recording.sampling_rate_hz)
     yield from _duplicates(recording)
     yield from _stimulus_rows(recording)
     if unknown := int(np.count_nonzero(np.all(stimuli.electrodes == UNKNOWN, axis=1) & ~stimuli.is_rest)):
@@ -71,6 +76,7 @@ def _stimulus_rows(recording: Recording) -> Iterable[Finding]:
         ratio = len(times_s) / n_spikes
         message = f"{len(times_s):,} stimuli for {n_spikes:,} spikes: are spikes and stimuli swapped?"
         yield Finding("more-stimuli-than-spikes", "refuse" if ratio >= STIMULI_PER_SPIKE else "note", message, ratio)
+    yield from _order(recording)
     last = recording.stimuli.is_last_of_presentation
     if same := int(np.count_nonzero((np.diff(times_s) == 0) & last[:-1])):
         found = f"{same:,} of {len(times_s):,} stimuli come at exactly the same time as the previous one"
@@ -86,6 +92,22 @@ def _stimulus_rows(recording: Recording) -> Iterable[Finding]:
         counts = "the response counts for that of the last pulse: correct the frequencies or stimulus_presentation"
         message = f"{found}, and {counts}"
         yield Finding("trials-of-several-frequencies", "warning", message, float(several))
+
+
+def _order(recording: Recording) -> Iterator[Finding]:
+    """A finding on trials whose frequencies are not in the stated order; those of a protocol are."""
+    frequency_hz = recording.stimuli.frequency_hz[recording.stimuli.is_last_of_presentation]
+    frequency_hz = frequency_hz[~np.isnan(frequency_hz)]
+    shares = np.unique(frequency_hz, return_counts=True)[1] / max(1, len(frequency_hz))
+    if recording.presentation is None or recording.protocol is not None or len(frequency_hz) < MANY_STIMULI:
+        return
+    # In random order, the share of trials with another frequency than the one before.
+    mixed, order = 1 - float(np.sum(shares**2)), recording.presentation.order
+    changes = float(np.mean(~is_same(frequency_hz[1:], frequency_hz[:-1])))
+    if len(shares) > 1 and (changes > mixed / 2) != (order == "mixed"):
+        found = f"the frequency changes {'from trial to trial' if changes > mixed / 2 else 'hardly ever'}"
+        message = f"stimuli are stated to be {order}, but {found} ({100 * changes:.0f} % of the trials): correct it"
+        yield Finding("other-order", "warning", message, changes)
 
 
 def _duplicates(recording: Recording) -> Iterable[Finding]:

@@ -20,6 +20,8 @@ FAR = 30.0
 """Intervals must be this many times as long, or as short, as stated by the frequencies."""
 AGREE = 0.05
 """Tolerance between the factors of the frequencies: a wrong unit gives all of them the same factor."""
+REGULAR = 0.9
+"""Share of the intervals of a frequency that must be alike, for the frequency to be what decides them."""
 APART = 1.5
 """Smallest ratio of the highest to the lowest frequency: a constant interval fits all frequencies that are similar."""
 LONG_S = 2 * 3600.0
@@ -111,24 +113,39 @@ def _common_factor(stimuli: Stimuli, sampling_rate_hz: float) -> Finding | None:
 
 def _sooner_than_stated(stimuli: Stimuli) -> Iterator[Finding]:
     """A finding on stimuli that come sooner than their stated frequency allows."""
-    sooner = []
+    sooner, regular = [], []
     for multiples_of in _multiples(stimuli):
-        medians = [(float(np.median(m)), hz) for hz, m in multiples_of.items() if len(m) >= ENOUGH_STIMULI]
-        sooner.append(min(medians, default=(1.0, 0.0)))
-    least, stated_hz = max(sooner)
+        enough = {hz: multiples for hz, multiples in multiples_of.items() if len(multiples) >= ENOUGH_STIMULI}
+        sooner.append(min(((float(np.median(m)), hz) for hz, m in enough.items()), default=(1.0, 0.0)))
+        if _is_regular(enough):
+            regular.append(sooner[-1])
+    # If intervals are regular counted in one of the two ways only, this is how frequencies are stated.
+    least, stated_hz = max(sooner) if len(regular) != 1 else regular[0]
     if least > 1 / APART:
         return
-    periods = [(multiple, hz) for multiple, hz in sooner if abs(multiple - hz**2) < AGREE * hz**2]
-    least, stated_hz = periods[0] if periods else (least, stated_hz)
+    units = {"seconds": 1.0, "milliseconds": 1e3}
+    periods = [
+        (each, unit) for each in sooner for unit, n in units.items() if abs(n * each[0] / each[1] ** 2 - 1) < AGREE
+    ]
+    remedy = "correct the frequencies, or group the stimuli by their times (--conditions interval:5,10)"
+    if periods:
+        (least, stated_hz), unit = periods[0]
+        remedy = (
+            f"these are periods in {unit}: write {units[unit]:,g} divided by each, here {units[unit] / stated_hz:g}"
+        )
     interval_s = least / stated_hz
-    remedy = (
-        f"these are periods in seconds: write 1 divided by each, here {1 / stated_hz:g}"
-        if periods
-        else "correct the frequencies, or group the stimuli by their times (--conditions interval:5,10)"
-    )
     apart = f"{interval_s:.3g} s apart (median), not {1 / stated_hz:.3g} s"
     message = f"stimuli with a stated frequency of {stated_hz:g} Hz are {apart}: {remedy}"
     yield Finding(CONTRADICTED, "warning", message, least)
+
+
+def _is_regular(multiples_of: dict[float, Float64[np.ndarray, " intervals"]]) -> bool:
+    """Whether nearly all intervals of each frequency are alike, and those of different frequencies are not."""
+    medians_s = [float(np.median(multiples)) / hz for hz, multiples in multiples_of.items()]
+    if len(medians_s) < 2 or max(medians_s) < APART * min(medians_s):
+        return False
+    of_each = [np.mean(np.abs(m / np.median(m) - 1) < AGREE) for m in multiples_of.values()]
+    return bool(min(of_each) > REGULAR)
 
 
 def _unit(multiple: float, sampling_rate_hz: float) -> str | None:
@@ -246,7 +263,7 @@ def silences(recording: Recording) -> Iterator[Finding]:
     ended = ", or did it end earlier than stated" if longest[:n].max() == len(length_s) - 1 else ""
     where = ", ".join(f"from {times_s[i]:.12g} to {times_s[i + 1]:.12g} s" for i in sorted(longest[:n].tolist()))
     message = (
-        f"no spike on any channel {where} ({total_s:.3g} s), while no other silence is longer than "
+        f"no spike on any channel {where} ({_plain(total_s)} s), while no other silence is longer than "
         f"{of_longest_s[n]:.2g} s: was recording interrupted{ended}? If so, cut the recording there, as it counts in "
         "rates"
     )

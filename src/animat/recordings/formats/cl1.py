@@ -18,6 +18,8 @@ from animat.tables import padded
 USUAL_RATE_HZ = 25_000.0
 _TEXT_HEADERS = {0xD9: 2, 0xDA: 3, 0xDB: 5}
 _LARGEST_CHANNEL_COUNT = 4096
+_TOGETHER_FRAMES = 2
+"""A pulse lasts longer: stimuli that follow so soon are of other electrodes, and of the same pulse."""
 
 
 def is_cl1(file: Hdf5File) -> bool:
@@ -83,14 +85,14 @@ def _first_frame(file: Hdf5File, spike: Column, stimulus: Column) -> int:
 
 
 def _stimuli(file: Hdf5File) -> tuple[Column, dict[str, Any]]:
-    """First frame of each stimulus, and its electrodes."""
+    """First frame of each stimulus, and its electrodes, which may be a frame or two apart."""
     if not file.has("stims"):
         return np.empty(0, np.int64), {}
     columns = [column.astype(np.int64) for column in file.columns("stims", "timestamp", "channel")]
     frame, channel = np.unique(np.stack(columns), axis=1)
-    frames, first = np.unique(frame, return_index=True)
-    electrodes = np.split(channel, first[1:])[: len(frames)]
-    return frames, {"stimulus_electrodes": padded([pulsed.tolist() for pulsed in electrodes])}
+    first = np.flatnonzero(np.diff(frame, prepend=-np.inf) > _TOGETHER_FRAMES)
+    electrodes = np.split(channel, first[1:])[: len(first)]
+    return frame[first], {"stimulus_electrodes": padded([pulsed.tolist() for pulsed in electrodes])}
 
 
 def _parameters(file: Hdf5File, stimulus: Column, findings: list[Finding]) -> dict[str, Any]:

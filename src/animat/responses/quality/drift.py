@@ -56,10 +56,12 @@ def drift_findings(responses: Responses) -> Iterator[Finding]:
     span = "in the order of the rows" if responses.time_s is None else f"recording: {np.ptp(time_s) / 60:.1f} min"
     # A line through responses, which are not below 0, changes by no more; they stop, say, instead.
     by = f"{100 * abs(slope):.0f} % of their mean (+- {100 * error:.0f} %)"
-    by = by if abs(slope) <= _MOST else f"more than {100 * _MOST:.0f} % of their mean, as if they stopped or began"
+    by = by if abs(slope) <= _MOST else f"more than {100 * _MOST:.0f} % of their mean"
     message = (
         f"responses {'rise' if slope > 0 else 'fall'} by {by} from a condition's first stimuli to its last ({span})"
     )
+    if abs(slope) > _MOST:
+        message += f", as if they {'began' if slope > 0 else 'stopped'} in between"
     large = abs(slope) > LARGE
     if large:
         message += (

@@ -52,6 +52,14 @@ def series_findings(series: Sequence[Responses]) -> Iterator[Finding]:
             )
             yield Finding("several-cultures", "refuse", message)
             break
+    known = [each.recording for each in series if each.recording is not None]
+    for one_of, next_of in pairwise(sorted(known, key=lambda recording: recording.start_min)):
+        over_s = one_of.duration_s - 60 * (next_of.start_min - one_of.start_min)
+        if 0.01 * one_of.duration_s < over_s < one_of.duration_s:
+            at = f"that at {in_min(one_of.start_min)} lasts {over_s:.3g} s longer than to the next"
+            message = f"recordings overlap in time: {at}, at {in_min(next_of.start_min)}: correct start_min"
+            yield Finding("recordings-overlap", "warning", message, over_s)
+            break
     if not series:
         return
     n_channels = [responses.n_channels for responses in series]
