@@ -477,6 +477,23 @@ def test_dead_and_noisy_channels_are_said() -> None:
     assert 3 not in found.channel
 
 
+@pytest.mark.parametrize(("sign", "is_inverted"), [(1, False), (-1, True), (0, False)])
+def test_inverted_traces_cause_a_warning(sign: int, is_inverted: bool) -> None:
+    voltage, _ = noisy(30, 4.0)
+    if not sign:
+        voltage = np.random.default_rng(0).normal(0, 50, voltage.shape).astype(np.int16)
+    found = detect_spikes(RawTraces.from_array((sign or 1) * voltage, channels(30), RATE_HZ, uv_per_step=0.1))
+    assert ("inverted" in {finding.name for finding in found.findings}) == is_inverted
+
+
+@pytest.mark.parametrize(("uv_per_step", "severity"), [(0.1, "note"), (1e5, "warning"), (1e-4, "warning")])
+def test_traces_in_another_unit_cause_a_warning(uv_per_step: float, severity: str) -> None:
+    found = detect_spikes(RawTraces.from_array(noisy(30, 1.0)[0], channels(30), RATE_HZ, uv_per_step=uv_per_step))
+    noise = next(finding for finding in found.findings if finding.name == "noise")
+    assert noise.severity == severity
+    assert ("are the traces in volts?" in noise.message) == (severity == "warning")
+
+
 @pytest.mark.parametrize(
     ("setting", "value"),
     [("band_hz", (300.0, 100.0)), ("threshold", 0.0), ("blank_ms", (0.0, -1.0)), ("chunk_s", 0.0)],

@@ -18,7 +18,7 @@ from animat.progress import Progress, Silent
 from animat.recordings.detection.artefacts import Counts, Flags, Levels, Pulses, Traces
 from animat.recordings.detection.pieces import Piece, read_piece
 from animat.recordings.detection.settings import Detection
-from animat.recordings.findings import Finding
+from animat.recordings.findings import Finding, Severity
 from animat.recordings.raw import RawTraces
 
 ORDER = 3
@@ -39,6 +39,11 @@ LEVEL_STEP = 20
 DEAD, NOISY = 0.1, 5.0
 """Multiples of the median channel's noise: a channel below is dead, one above is noisy."""
 MUCH_LOST = 0.01
+USUAL_UV = 0.2, 500.0
+"""Noise between these is that of an amplifier in the right unit, with a wide margin."""
+ENOUGH_BEYOND, TIMES_ABOVE = 1000.0, 2.0
+"""Traces are inverted if the cubes of the samples above the noise, in multiples of the threshold, sum up to so much, or
+more, and to so many times as much as those below it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +91,7 @@ def detect_spikes(
     # Simultaneous pulses are one.
     stimulus = np.unique(np.rint((times_s - traces.start_s) * rate_hz)).astype(np.int64)
     workers = workers or len(own_cores())
-    noise_uv, level_uv = _noise_and_level_uv(traces, stimulus, settings, workers)
+    noise_uv, level_uv, below, above = _noise_and_level_uv(traces, stimulus, settings, workers)
     length = max(round(settings.chunk_s * rate_hz), 1)
 
     def search(start: int) -> _Found:
@@ -109,6 +114,7 @@ def detect_spikes(
     sample, channel = np.concatenate(samples), np.concatenate(channels)
     order = np.lexsort((channel, sample))
     findings = *_lost(lost, traces.samples), *_findings(noise_uv, len(stimulus), saturations, settings)
+    findings += tuple(_inverted(float(below.sum()), float(above.sum())))
     return DetectedSpikes(traces.start_s + sample[order] / rate_hz, channel[order], noise_uv, findings)
 
 
@@ -127,32 +133,41 @@ def blocks(channels: int) -> Iterator[slice]:
 
 def _noise_and_level_uv(
     traces: RawTraces, stimulus: Pulses, settings: Detection, workers: int
-) -> Float32[np.ndarray, "2 channels"]:
-    """The noise of each channel and its usual voltage: medians over pieces spread over the recording."""
+) -> Float32[np.ndarray, "4 channels"]:
+    """The noise of each channel and its usual voltage: medians over pieces spread over the recording.
+
+    And the sum of the cubes of their samples beyond the threshold, below the noise and above.
+    """
     rate_hz, channels = traces.sampling_rate_hz, len(traces.channels)
     length, margin = round(NOISE_PIECE_S * rate_hz), round(MARGIN_S * rate_hz)
     n = max(1, min(NOISE_PIECES, traces.samples // max(length, 1)))
     starts = np.linspace(0, max(traces.samples - length, 0), n).astype(np.int64)
 
     def of_piece(start: int) -> np.ndarray:
-        medians_uv = np.zeros((2, channels), np.float32)
+        found = np.zeros((4, channels), np.float32)
         piece = read_piece(traces, stimulus, start, min(start + length, traces.samples), margin)
         for columns in blocks(channels):
             rows = np.ascontiguousarray(piece.voltage_uv[piece.lead :, columns].T)
             level_uv = np.median(rows[:, ::LEVEL_STEP], axis=1)
-            first = median_noise_uv(band_pass(rows, settings.band_hz, rate_hz)[:, margin:-margin])
+            filtered = band_pass(rows, settings.band_hz, rate_hz)
+            first = median_noise_uv(filtered[:, margin:-margin])
             if len(piece.stimulus) or piece.is_lost is not None:
                 cleaned = piece.cleaned(columns, first, level_uv, rate_hz, settings)
                 filtered = band_pass(cleaned.voltage_uv, settings.band_hz, rate_hz)
                 first = median_noise_uv(filtered[:, margin:-margin], cleaned.is_blank[:, margin:-margin])
-            medians_uv[:, columns] = first, level_uv
-        return medians_uv
+                filtered[cleaned.is_blank] = 0.0
+            # In multiples of the threshold; a channel without noise has none.
+            beyond = filtered[:, margin:-margin] / np.where(first > 0, settings.threshold * first, np.inf)[:, None]
+            beyond = np.where(np.abs(beyond) > 1, beyond, 0) ** 3
+            found[:, columns] = first, level_uv, -beyond.clip(max=0).sum(axis=1), beyond.clip(min=0).sum(axis=1)
+        return found
 
     with ThreadPoolExecutor(workers) as pool:
         pieces = np.array(list(pool.map(of_piece, starts.tolist())))
     # A channel that is blanked in all pieces is dead.
     pieces[:, np.isnan(pieces).all(axis=0)] = 0.0
-    return np.asarray(np.nanmedian(pieces, axis=0), dtype=np.float32)
+    medians_uv = np.nanmedian(pieces[:, :2], axis=0)
+    return np.asarray(np.concatenate([medians_uv, pieces[:, 2:].sum(axis=0)]), dtype=np.float32)
 
 
 class _Found(NamedTuple):
@@ -268,11 +283,26 @@ def _lost(lost: Counts, samples: int) -> Iterator[Finding]:
         yield Finding("samples-lost", "note" if share < MUCH_LOST else "warning", message, float(n))
 
 
+def _inverted(below: float, above: float) -> Iterator[Finding]:
+    """A finding on traces whose spikes point upwards, by the sums of the cubes of the samples beyond the threshold."""
+    if above > ENOUGH_BEYOND and above > TIMES_ABOVE * below:
+        message = (
+            "peaks above the noise are higher than those below it are deep, but the deep phase of a spike outside a "
+            "cell is negative: if the traces are inverted, multiply them by -1"
+        )
+        yield Finding("inverted", "warning", message, above / max(below, 1))
+
+
 def _findings(noise_uv: Levels, n_stimuli: int, saturation: np.ndarray, settings: Detection) -> Iterator[Finding]:
     n, living_uv = len(noise_uv), noise_uv[~is_dead(noise_uv)]
     middle = float(np.median(living_uv)) if len(living_uv) else 0.0
-    yield Finding("noise", "note", f"noise: {middle:.2f} uV on the median of {len(living_uv):,} channels; spikes are "
-                  f"negative peaks of {settings.threshold:g} times their channel's noise and more", middle)  # fmt: skip
+    level: Severity = "note" if not len(living_uv) or USUAL_UV[0] < middle < USUAL_UV[1] else "warning"
+    asked = "" if level == "note" else ": are the traces in volts? State their unit, or conversion factor"
+    message = (
+        f"noise: {middle:.2f} uV on the median of {len(living_uv):,} channels; spikes are negative peaks of "
+        f"{settings.threshold:g} times their channel's noise and more{asked}"
+    )
+    yield Finding("noise", level, message, middle)
     if dead := n - len(living_uv):
         what = "no spike can be detected there, and they count in rates per channel; leave them out of the routing"
         message = f"dead channels (less than {DEAD:g} of the usual noise): {dead:,} of {n:,}; {what}"
