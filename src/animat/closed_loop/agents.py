@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Protocol, get_args
+from typing import Any, get_args
 
 import jax
 import numpy as np
@@ -14,14 +14,8 @@ from jaxtyping import Array, Float, Float64
 from animat.environment import Animat, Environment
 from animat.errors import InvalidArgument, shown
 from animat.evaluation.controls import RANDOM, Control, Delivered
+from animat.evaluation.own_agents import Called, Controller
 from animat.evaluation.rollouts import Actor, Constant, Networks, Uniform
-
-
-class Controller(Protocol):
-    """What chooses conditions: a `Policy`, or anything else that acts like one."""
-
-    def act(self, observation: Float[np.ndarray, " observations"], rng: np.random.Generator) -> Any:
-        """The index of the condition to present, for the robot's observation in its own units."""
 
 
 @dataclass(frozen=True)
@@ -158,6 +152,8 @@ def agent_of(
         controller = AnyCondition(environment.n_conditions)
     elif isinstance(actor, Constant):
         controller = OneCondition(int(actor.action[0]))
+    elif isinstance(actor, Called):
+        controller = actor.controller
     else:
         controller = ActorController(actor, environment)
     return Agent(

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from animat.closed_loop.adaptive import AdaptiveThresholds
-from animat.closed_loop.agents import Agent, Controller
+from animat.closed_loop.agents import Agent
 from animat.closed_loop.log import Record
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.runner import runner_of
@@ -27,6 +27,7 @@ from animat.cultures.base import Culture
 from animat.cultures.budget import Account
 from animat.cultures.failures import describe_error
 from animat.errors import AnimatError, BudgetSpent
+from animat.evaluation.own_agents import Controller
 from animat.neurons.history_tracker import HistoryState
 from animat.responses.extraction import SILENCE_S
 from animat.robots.starts import robot_generator

@@ -81,7 +81,9 @@ class Control:
     ) -> Episodes:
         """Its episodes in the policies' environment and simulator, changed for it; errors as in `roll_out`."""
         changed = self.within(environment, simulator)
-        return roll_out(*changed, self.actor, episodes=episodes, seed=seed, starts=starts)
+        ran = roll_out(*changed, self.actor, episodes=episodes, seed=seed, starts=starts)
+        self.actor.expect_no_failure()
+        return ran
 
 
 RANDOM = Control("random", "any action, equally likely", Uniform())

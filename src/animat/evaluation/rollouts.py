@@ -45,6 +45,9 @@ class Actor(abc.ABC):
         arrays = jax.tree.leaves(self)
         return len(arrays[0]) if arrays else 1
 
+    def expect_no_failure(self) -> None:  # noqa: B027 - only actors that call something outside JAX can fail
+        """Raise InvalidArgument if it failed to act since the last call."""
+
 
 @final
 @partial(jax.tree_util.register_dataclass, data_fields=["network", "scales"], meta_fields=["greedy"])

@@ -20,7 +20,8 @@ from animat.evaluation.coupling import ContextGap, context_gap, least_context_ga
 from animat.evaluation.interventions import InterventionTable, run_interventions
 from animat.evaluation.optimal_returns import WellSampled
 from animat.evaluation.optimum import Optimum, best_return
-from animat.evaluation.rollouts import networks_of
+from animat.evaluation.own_agents import Controller, controls_of_own
+from animat.evaluation.rollouts import Actor, networks_of
 from animat.evaluation.statistics import Interval, Verdict, normalised_score
 from animat.goals.robot import objectives_of
 from animat.goals.tally import MEANS, cells_of, satisfaction_line
@@ -199,6 +200,7 @@ def evaluate(
     greedy: bool = True,
     robot: Robot[Any] | None = None,
     controls: str | Collection[str] | None = None,
+    agents: Mapping[str, Actor | Controller] | None = None,
     optimum_resolution: float | None = None,
     interventions: bool = False,
     progress: Progress | None = None,
@@ -213,13 +215,15 @@ def evaluate(
         greedy: whether to take the most probable action, or to draw from the policy as in training.
         robot: the robot to run them on, possibly with changed parameters; None: the one they were trained on.
         controls: names of the controls to run; None: all.
+        agents: of your own, by name: rows like those of the controls (docs/agents.md).
         optimum_resolution: of the grid for the optimal return in the same environment (`best_returns`; 1 in a study),
             which takes seconds. The best coupling, which also takes seconds, is then among the controls. None: neither.
         interventions: whether to run the policies with all interventions too (`animat.evaluation.interventions`).
         progress: updated after the policies and each control, during the optimum, and before each intervention.
 
     Raises:
-        InvalidArgument: for no policies, unknown controls, interventions without neurons, or a number out of range.
+        InvalidArgument: for no policies, unknown controls, interventions without neurons, a number out of range, or an
+            agent that cannot act.
         Mismatch: if the policies differ from each other, from the robot or from the timeline's conditions.
     """
     alike = ("robot", "mapping", "readouts", "conditions", "commands", "percentiles", "delivery", "pulse_cost")
@@ -248,6 +252,7 @@ def evaluate(
         if unknown := sorted({*controls} - {*known, "heuristic", "coupling"}):
             raise InvalidArgument(f"controls: expected some of {', '.join(known)}, got {', '.join(unknown)}")
     acting = [trained, *(control for control in all_controls if controls is None or control.name in controls)]
+    acting += controls_of_own(agents or {}, ["policies", "coupling", *(each.name for each in all_controls)])
     wants_coupling = optimum_resolution is not None and (controls is None or "coupling" in controls)
     searches = wants_coupling and not isinstance(body, HostRobot)
     steps = len(acting) + searches

@@ -15,6 +15,7 @@ from jaxtyping import Float64
 
 from animat.environment import Environment
 from animat.evaluation.controls import Control, Delivered
+from animat.evaluation.own_agents import Called
 from animat.evaluation.rollouts import Episodes, Uniform
 from animat.evaluation.statistics import Interval
 from animat.process import own_cores
@@ -100,18 +101,20 @@ def predict(
     """
     progress = progress or Silent()
     simulators = [calibration.simulator] * ROLL_OUTS + list(calibration.bootstraps)
-    if isinstance(environment.robot, HostRobot):
-        simulators = simulators[: ROLL_OUTS + BOOTSTRAPS_ON_HOST]
-    episodes, rounds = episodes_each(environment.robot, starts), 1 if starts is None else starts.rounds
+    on_host = isinstance(environment.robot, HostRobot)
+    rounds = 1 if starts is None else starts.rounds
     acting = [policies, *map(_with_random_actor, controls)]
+
+    def is_slow(number: int) -> bool:
+        return on_host or isinstance(acting[number].actor, Called)
 
     def run(number: int, on: int) -> Episodes:
         drawn = roll_out_seed(seed, number, on)
+        episodes = episodes_each(environment.robot, starts, is_slow=is_slow(number))
         return acting[number].run(environment, simulators[on], episodes=episodes, seed=drawn, starts=starts)
 
     predictions: dict[str, Prediction] = {}
     # A hanging body on the host is only noticed in the main thread (`animat.robots.host.time_limit`).
-    on_host = isinstance(environment.robot, HostRobot)
     with nullcontext() if on_host else ThreadPoolExecutor(len(own_cores())) as executor:
         side_by_side = map if executor is None else executor.map
         # First one of each kind: two of a kind that start at the same time would both be compiled.
@@ -120,7 +123,8 @@ def predict(
         list(side_by_side(run, kinds.values(), repeat(0)))
         for number, control in enumerate(acting):
             progress.update(number, len(acting), control.name)
-            ran = list(side_by_side(run, repeat(number), range(len(simulators))))
+            n = min(len(simulators), ROLL_OUTS + BOOTSTRAPS_ON_HOST) if is_slow(number) else len(simulators)
+            ran = list(side_by_side(run, repeat(number), range(n)))
             returns = np.array([each.returns for each in ran])
             presented = np.array([each.presented for each in ran])
             total = np.array([each.commanded for each in ran]).reshape(*presented.shape, -1)
@@ -139,14 +143,14 @@ def predict(
     return predictions
 
 
-def episodes_on_host(robot: HostRobot) -> int:
+def episodes_on_host(robot: Robot[Any]) -> int:
     """Fewest episodes of each policy: 20, or fewer if longer than 200 iterations, but at least 4."""
     return max(4, min(MOST_ON_HOST, 4_000 // robot.episode_limit))
 
 
-def episodes_each(robot: Robot[Any], starts: Starts | None) -> int:
-    """Episodes of each policy in a roll-out, from each start equally many."""
-    least = episodes_on_host(robot) if isinstance(robot, HostRobot) else EPISODES
+def episodes_each(robot: Robot[Any], starts: Starts | None, *, is_slow: bool = False) -> int:
+    """Episodes of each policy in a roll-out, from each start equally many; fewer where a robot or an agent is slow."""
+    least = episodes_on_host(robot) if is_slow or isinstance(robot, HostRobot) else EPISODES
     return least if starts is None else starts.rounds * math.ceil(least / starts.rounds)
 
 

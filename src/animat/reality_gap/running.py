@@ -28,7 +28,8 @@ from animat.evaluation import transfer
 from animat.evaluation.controls import RANDOM, Control, controls_of, coupling_of, interventions_of
 from animat.evaluation.optimal_returns import too_few
 from animat.evaluation.optimum import optimal_values
-from animat.evaluation.rollouts import networks_of
+from animat.evaluation.own_agents import Controller, controls_of_own
+from animat.evaluation.rollouts import Actor, networks_of
 from animat.evaluation.statistics import compare_episodes
 from animat.goals.tally import Outcome
 from animat.progress import Progress, in_phase
@@ -74,6 +75,7 @@ def run_policies(
     with_controls: bool = True,
     with_coupling: bool = False,
     with_interventions: bool = False,
+    agents: Mapping[str, Actor | Controller] | None = None,
     greedy: bool = True,
     seed: int = 1,
     pulses: int | None = None,
@@ -101,6 +103,7 @@ def run_policies(
         with_coupling: whether to run the best coupling too, which is first searched on the calibration's simulator.
         with_interventions: whether to run the policies also with random spikes instead of responses, yoked stimuli, the
             mapping turned round and, for a robot with several goals, the goal switched; adds `whose_work`.
+        agents: of your own, by name, with as many episodes each as a policy (docs/agents.md).
         greedy: whether policies take the most probable action, or draw as in training.
         seed: decides every random draw except those of the culture.
         pulses: per trial; None: as in the policies' recordings.
@@ -161,13 +164,14 @@ def run_policies(
         actuator, *changed = interventions_of(environment, simulator, networks, switch_at=half_way)
         ideal = actuator, actuator.run(environment, simulator, **simulated).returns.ravel()
         controls += [each for each in changed if each.name not in ("silent", "shuffled")]
+    own = controls_of_own(agents or {}, [*policies, *(control.name for control in controls)])
     acting = {name: Greedy(policy) if greedy else policy for name, policy in policies.items()}
     pooled = np.concatenate(calibration.responses_hz)
-    agents = [Agent(name, trained.meaning, controller) for name, controller in acting.items()]
-    agents += [agent_of(control, animat, acting, pooled) for control in controls]
+    taking_turns = [Agent(name, trained.meaning, controller) for name, controller in acting.items()]
+    taking_turns += [agent_of(control, animat, acting, pooled) for control in (*controls, *own)]
 
-    of_each = planned_episodes(len(policies), len(controls), episodes)
-    check_session(culture, loop, agents, of_each, seed)
+    of_each = planned_episodes(len(policies), len(controls), episodes) + [episodes] * len(own)
+    check_session(culture, loop, taking_turns, of_each, seed)
 
     # The optimal return meanwhile, on another core: a session must not wait for one.
     thread = ThreadPoolExecutor(1)
@@ -176,7 +180,7 @@ def run_policies(
         predicted = predict(
             trained,
             tuple(policies),
-            controls,
+            (*controls, *own),
             environment,
             # Fixed thresholds stay the same in bootstraps; adaptive ones would adapt to their responses.
             calibration if calibration.adaptive else calibration.with_percentiles(simulator.percentiles),
@@ -190,7 +194,8 @@ def run_policies(
         raise
     optimum, why_none = computed.result()
     plan = [
-        (n, predicted[each.name].presented, each.delivery != "silent") for n, each in zip(of_each, agents, strict=True)
+        (n, predicted[each.name].presented, each.delivery != "silent")
+        for n, each in zip(of_each, taking_turns, strict=True)
     ]
     expected = outlook(loop, calibration, plan, account, age_min)
     findings = (*noticed, *findings, *why_none, *calibration.findings)
@@ -204,7 +209,7 @@ def run_policies(
     session = run_session(
         culture,
         loop,
-        agents,
+        taking_turns,
         folder,
         episodes=of_each,
         seed=seed,
@@ -212,7 +217,7 @@ def run_policies(
         progress=in_phase(progress, "closed loop", sum(of_each), "episodes"),
         predicted={name: of.interval for name, of in predicted.items()},
     )
-    rows = _rows(agents, tuple(policies), predicted, session, loop, first.pulse_cost, starts)
+    rows = _rows(taking_turns, tuple(policies), predicted, session, loop, first.pulse_cost, starts)
     gap_reasons: tuple[Finding, ...] = ()
     if sign := rows[0].gap_sign:
         responses = read_responses(session, loop, tuple(policies))

@@ -1,0 +1,84 @@
+"""Agents of one's own, in JAX or not, as rows of the tables beside policies and controls."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from typing import Any, Protocol, final
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from animat.environment import Environment
+from animat.errors import InvalidArgument, shown, some_of
+from animat.evaluation.controls import Control
+from animat.evaluation.rollouts import Actor, Seen, Uniforms
+
+_GRID = 2**24
+"""Uniforms of single precision are multiples of 1 / 2^24."""
+
+
+class Controller(Protocol):
+    """What chooses conditions: a `Policy`, or anything else that acts like one."""
+
+    def act(self, observation: Float[np.ndarray, " observations"], rng: np.random.Generator) -> Any:
+        """The index of the condition to present, for the robot's observation in its own units."""
+
+
+@final
+@jax.tree_util.register_static
+class Called(Actor):
+    """A controller outside JAX as an actor: it is called for every observation of every episode.
+
+    What goes wrong in a call is kept, as JAX would report it in its own words; see `expect_no_failure`.
+    """
+
+    def __init__(self, name: str, controller: Controller) -> None:
+        self.name, self.controller = name, controller
+        self._failure: Exception | None = None
+
+    def act(self, environment: Environment[Any], observation: Seen, uniforms: Uniforms) -> Array:
+        n, seen = environment.n_actions, observation * environment.scales
+        if not getattr(self.controller, "neural_observation", False):
+            seen = seen[:, : len(environment.robot.observation_spec)]
+
+        def choose(observation: np.ndarray, uniforms: np.ndarray) -> np.ndarray:
+            return np.array([self._choose(*each, n) for each in zip(observation, uniforms, strict=True)], np.int32)
+
+        chosen = jax.ShapeDtypeStruct(observation.shape[:1], jnp.int32)
+        called: Array = jax.pure_callback(choose, chosen, seen, uniforms[:, 0], vmap_method="sequential")
+        return called
+
+    def _choose(self, observation: np.ndarray, uniform: float, n_actions: int | None) -> int:
+        if self._failure is not None:
+            return 0
+        try:
+            chosen = self.controller.act(np.asarray(observation), np.random.default_rng(int(uniform * _GRID)))
+            if n_actions is None or chosen not in range(n_actions):
+                which = "a condition" if n_actions is None else f"a condition, a whole number from 0 to {n_actions - 1}"
+                raise InvalidArgument(f"act: expected the index of {which}, got {shown(chosen)}")
+            return int(chosen)
+        except Exception as error:
+            self._failure = error
+            return 0
+
+    def expect_no_failure(self) -> None:
+        if (failure := self._failure) is not None:
+            self._failure = None
+            raise InvalidArgument(f"agents: {self.name}: {type(failure).__name__}: {failure}") from failure
+
+
+def controls_of_own(agents: Mapping[str, Actor | Controller], taken: Collection[str]) -> list[Control]:
+    """Agents of one's own as controls; InvalidArgument for one that cannot act, or whose name is `taken`."""
+    controls = []
+    for name, agent in agents.items():
+        if name in taken:
+            raise InvalidArgument(f"agents: expected names other than {some_of(sorted(taken))}, got {name}")
+        if not callable(getattr(agent, "act", None)):
+            raise InvalidArgument(f"agents: {name}: expected an Actor, or a method `act`, got {shown(agent)}")
+        actor = agent if isinstance(agent, Actor) else Called(name, agent)
+        if actor.n_actors != 1:
+            raise InvalidArgument(f"agents: {name}: expected one actor, got {actor.n_actors} side by side")
+        controls.append(Control(name, "your own agent", actor))
+    return controls
