@@ -1,0 +1,148 @@
+"""Agents of one's own in the tables: against the policies that they wrap, and the same rule in JAX and outside."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from animat.closed_loop.agents import Greedy
+from animat.errors import InvalidArgument
+from animat.evaluation.rollouts import Actor
+from animat.evaluation.table import evaluate
+from animat.neurons.timeline import SimulatorTimeline, fit_timeline
+from animat.reality_gap.calibration import Calibration
+from animat.reality_gap.running import run_policies
+from animat.recordings.recording import Recording
+from animat.responses.extraction import extract_responses
+from animat.responses.responses import Responses
+from animat.robots import Cartpole
+from fake_culture import FakeCulture
+from test_evaluation import policy_of
+from test_optimal_returns import answers
+from test_reality_gap import PROTOCOL
+from test_reality_gap import policy_of as navigator_of
+
+PAGE = Path(__file__).parents[1] / "docs" / "agents.md"
+
+
+@jax.tree_util.register_static
+@dataclass(frozen=True)
+class Falling(Actor):
+    """The fastest condition if the pole leans to the right."""
+
+    def act(self, environment: Any, observation: Any, uniforms: Any) -> Any:
+        return jnp.where(observation[:, 2] > 0, 4, 0)
+
+
+class Plain:
+    def act(self, observation: np.ndarray, rng: np.random.Generator) -> Any:
+        return np.int64(4) if observation[2] > 0 else 0
+
+
+class AtRandom:
+    def act(self, observation: np.ndarray, rng: np.random.Generator) -> int:
+        return int(rng.integers(5))
+
+
+class Wrong:
+    def __init__(self, chosen: object) -> None:
+        self.chosen = chosen
+
+    def act(self, observation: np.ndarray, rng: np.random.Generator) -> object:
+        if isinstance(self.chosen, Exception):
+            raise self.chosen
+        return self.chosen
+
+
+def five_conditions() -> SimulatorTimeline:
+    return fit_timeline([answers([60] * 5, 1)], kind="histogram")
+
+
+def test_an_agent_outside_jax_is_evaluated_as_one_in_jax_and_a_policy_as_itself() -> None:
+    timeline = five_conditions()
+    policy = policy_of(timeline, Cartpole(episode_limit=30))
+    agents = {"in JAX": Falling(), "plain": Plain(), "the policy": Greedy(policy), "any": AtRandom()}
+    found = evaluate({"p0": policy}, timeline, episodes=40, controls=["random"], agents=agents)
+    returns = {row.name: row.episodes.returns.ravel() for row in found.rows}
+    assert [*returns] == ["policies", "random", *agents]
+    np.testing.assert_array_equal(returns["plain"], returns["in JAX"])
+    np.testing.assert_array_equal(returns["the policy"], returns["policies"])
+    error = np.hypot(returns["any"].std(), returns["random"].std()) / 40**0.5
+    assert abs(returns["any"].mean() - returns["random"].mean()) < 4 * error
+    assert len({*returns["any"].tolist()}) > 3
+    # Drawn from its own random numbers only, so the same again.
+    again = evaluate({"p0": policy}, timeline, episodes=40, controls=[], agents={"any": AtRandom()})
+    np.testing.assert_array_equal(again.rows[1].episodes.returns.ravel(), returns["any"])
+
+
+@pytest.mark.parametrize(
+    ("name", "agent", "message"),
+    [
+        ("mine", Wrong(17), "agents: mine: InvalidArgument: act: expected the index of .* from 0 to 4, got 17"),
+        ("mine", Wrong(0.5), "whole number from 0 to 4, got 0.5"),
+        ("mine", Wrong(None), "whole number from 0 to 4, got None"),
+        ("mine", Wrong(ZeroDivisionError("no")), "agents: mine: ZeroDivisionError: no"),
+        ("mine", 3, "agents: mine: expected an Actor, or a method `act`, got 3"),
+        ("random", Plain(), "agents: expected names other than .*, got random"),
+        ("policies", Plain(), "agents: expected names other than .*, got policies"),
+    ],
+)
+def test_an_agent_that_cannot_act_is_refused_in_one_line(name: str, agent: Any, message: str) -> None:
+    timeline = five_conditions()
+    policy = policy_of(timeline, Cartpole(episode_limit=30))
+    with pytest.raises(InvalidArgument, match=message) as refused:
+        evaluate({"p0": policy}, timeline, episodes=3, controls=[], agents={name: agent})
+    assert "\n" not in str(refused.value)
+    # The next one is not blamed for it.
+    evaluate({"p0": policy}, timeline, episodes=3, controls=[], agents={"mine": Plain()})
+
+
+def test_an_agent_runs_beside_policies_with_its_own_prediction(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("animat.reality_gap.calibration.BOOTSTRAPS", 4)
+    with FakeCulture() as culture:
+        recordings: list[Recording] = []
+        for seed in range(2):
+            recordings.append(culture.record(PROTOCOL, seed))
+            culture.rest(60.0)
+    series: list[Responses] = [extract_responses(each, burst_threshold=0.95) for each in recordings]
+    policies = {"p0": navigator_of(0, series), "p1": navigator_of(1, series)}
+    agents = {"like p1": Greedy(policies["p1"]), "first": Wrong(0)}
+    with FakeCulture() as culture:
+        gap = run_policies(
+            policies, culture, Calibration.of_series(series), tmp_path, episodes=4, with_controls=False, agents=agents
+        )
+    rows = {row.name: row for row in gap.rows}
+    assert [*rows] == ["policies", "p0", "p1", "random", *agents]
+    assert [len(rows[name].measured) for name in ("p0", "p1", *agents)] == [4] * 4
+    # Fewer episodes than of a policy: within their standard errors.
+    like, p1 = rows["like p1"].predicted, rows["p1"].predicted
+    assert len(like) < len(p1)
+    error = np.hypot(like.std() / len(like) ** 0.5, p1.std() / len(p1) ** 0.5)
+    assert abs(like.mean() - p1.mean()) < 4 * error + 1e-9
+    assert rows["like p1"].comparison is not None and "your own agent" in gap.to_text()
+    with (
+        FakeCulture() as culture,
+        pytest.raises(InvalidArgument, match=r"agents: expected names other than .*, got p0"),
+    ):
+        run_policies(policies, culture, Calibration.of_series(series), tmp_path / "b", agents={"p0": Wrong(0)})
+
+
+@pytest.mark.oracle
+def test_the_rules_of_the_page_are_one_rule() -> None:
+    blocks = re.findall(r"^```python\n(.*?)^```", PAGE.read_text(encoding="utf-8"), re.M | re.S)
+    names: dict[str, Any] = {"__name__": __name__}
+    for block in blocks[:2]:
+        exec(compile(block, str(PAGE), "exec"), names)
+    timeline = five_conditions()
+    policy = policy_of(timeline)
+    agents = {"rule": names["Rule"](policy.conditions), "in JAX": names["RuleInJax"](0, 4)}
+    rule, in_jax = evaluate({"p0": policy}, timeline, controls=[], agents=agents).rows[1:]
+    assert rule.episodes.returns.tolist() == in_jax.episodes.returns.tolist()
+    assert rule.episodes.returns.mean() > 0
