@@ -7,6 +7,7 @@ import pickle
 import subprocess
 import sys
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
@@ -568,3 +569,10 @@ def test_pictures_come_as_fast_as_the_robot_moves() -> None:
 def test_a_limit_by_another_name_is_refused_with_ours() -> None:
     with pytest.raises(InvalidArgument, match="'max_episode_steps': the robot's own is episode_limit"):
         gymnasium.make_vec("Animat/Cartpole-v0", 2, max_episode_steps=4)
+
+
+def test_an_id_with_a_robot_takes_no_other() -> None:
+    for make in (gymnasium.make, partial(gymnasium.make_vec, num_envs=2)):
+        with pytest.raises(InvalidArgument, match="the id names the cartpole, got 'shuttle': use Animat/Robot-v0"):
+            make("Animat/Cartpole-v0", robot="shuttle")
+    assert gymnasium.make("Animat/Cartpole-v0", robot="cartpole").unwrapped.setup.environment.robot == Cartpole()

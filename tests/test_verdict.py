@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import norm
 
-from animat.evaluation.statistics import EpisodeComparison, Verdict, compare_episodes
+from animat.evaluation.statistics import EpisodeComparison, Verdict, compare, compare_episodes
 
 returns = st.lists(st.integers(-5, 5).map(float), min_size=1, max_size=12)
 
@@ -63,3 +65,16 @@ def test_too_few_episodes_are_not_taken_for_no_difference() -> None:
     assert str(both).startswith("these policies do not outperform better (p = ")
     assert str(both).endswith("too few to show (p < 0.01) whether these policies outperform broken off")
     assert not EpisodeComparison(0.03, 1.0, 4, 4).has_enough_episodes
+
+
+@given(ours=returns, theirs=returns)
+def test_controls_are_outperformed_only_if_the_exact_p_is_small_too(ours: list[float], theirs: list[float]) -> None:
+    found = compare_episodes(ours, theirs)
+    assert found.p_exact == pytest.approx(compare(ours, theirs).p_exact)
+    # Of all ways to divide them, two are as far apart as can be.
+    assert found.has_enough_episodes == (2 / math.comb(len(ours) + len(theirs), len(ours)) < 0.01)
+    assert not found.is_outperformed or (found.p_exact < 0.01 and found.has_enough_episodes and found.wins > 0.5)
+
+
+def test_twelve_episodes_against_three_are_enough() -> None:
+    assert str(Verdict.of([120.0] * 12, {"a": [-80.0] * 3})).startswith("these policies outperform every control")

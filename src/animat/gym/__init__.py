@@ -30,5 +30,5 @@ def register_environments() -> None:
                 id_,
                 entry_point="animat.gym.environments:AnimatEnv",
                 vector_entry_point="animat.gym.environments:AnimatVectorEnv",
-                kwargs={} if robot is None else {"robot": robot},
+                kwargs={} if robot is None else {"robot_of_id": robot},
             )

@@ -45,8 +45,11 @@ class CompiledAnimats:
     metadata: dict[str, Any]
     render_mode: str | None
 
-    def __init__(self, n: int, robot: str, render_mode: str | None, options: dict[str, Any]) -> None:
-        self.setup = set_up(robot, **options)
+    def __init__(self, n: int, robot: str, robot_of_id: str, render_mode: str | None, options: dict[str, Any]) -> None:
+        if robot_of_id and robot not in ("", robot_of_id):
+            named = f"none, as the id names the {robot_of_id}"
+            raise InvalidArgument(f"robot: expected {named}, got {shown(robot)}: use Animat/Robot-v0")
+        self.setup = set_up(robot or robot_of_id, **options)
         if render_mode not in (None, "rgb_array"):
             hint = "; gymnasium.make shows these pictures in a window, with pygame" if render_mode == "human" else ""
             raise InvalidArgument(f"render_mode: expected 'rgb_array' or None, got {render_mode!r}{hint}")
@@ -165,15 +168,18 @@ class AnimatEnv(CompiledAnimats, gymnasium.Env[Float32[np.ndarray, " observation
     All random numbers come from the generator that `reset(seed=...)` seeds.
 
     Args:
-        robot: its name; set by the environment's id.
+        robot: its name, for `Animat/Robot-v0`.
+        robot_of_id: the robot of any other id.
         render_mode: `rgb_array`, or None.
         options: mapping, neurons and the robot's parameters (see `animat.gym.setup.set_up`).
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 50}  # noqa: RUF012 - Gymnasium's name and form
 
-    def __init__(self, robot: str = "", *, render_mode: str | None = None, **options: Any) -> None:
-        super().__init__(1, robot, render_mode, options)
+    def __init__(
+        self, robot: str = "", *, robot_of_id: str = "", render_mode: str | None = None, **options: Any
+    ) -> None:
+        super().__init__(1, robot, robot_of_id, render_mode, options)
         self.observation_space = self.setup.observation_space
         self.action_space = self.setup.action_space
 
@@ -214,7 +220,7 @@ class AnimatVectorEnv(CompiledAnimats, VectorEnv[Observations, Actions, Rewards]
 
     Args:
         num_envs: the number of environments.
-        robot, render_mode, options: as in `AnimatEnv`, the same for all.
+        robot, robot_of_id, render_mode, options: as in `AnimatEnv`, the same for all.
     """
 
     metadata = {  # noqa: RUF012 - Gymnasium's name and form
@@ -223,10 +229,18 @@ class AnimatVectorEnv(CompiledAnimats, VectorEnv[Observations, Actions, Rewards]
         "autoreset_mode": AutoresetMode.NEXT_STEP,
     }
 
-    def __init__(self, robot: str = "", num_envs: int = 1, *, render_mode: str | None = None, **options: Any) -> None:
+    def __init__(
+        self,
+        robot: str = "",
+        num_envs: int = 1,
+        *,
+        robot_of_id: str = "",
+        render_mode: str | None = None,
+        **options: Any,
+    ) -> None:
         expect_kind("num_envs", num_envs, int | np.integer, "a whole number")
         expect_at_least("num_envs", num_envs, 1)
-        super().__init__(num_envs, robot, render_mode, options)
+        super().__init__(num_envs, robot, robot_of_id, render_mode, options)
         self.num_envs = num_envs
         self.single_observation_space = self.setup.observation_space
         self.single_action_space = self.setup.action_space
