@@ -203,6 +203,10 @@ def test_a_task_that_a_reflex_solves_has_no_score() -> None:
     unsure = context_gap(120 + np.linspace(-80, 60, 60), np.full(60, -80.0), optimum_of(120.0))
     assert unsure.gap is not None and unsure.gap.low < 0.05 < unsure.gap.high
     assert "whether this task needs more than a reflex is not known" in unsure.to_text()
+    # In JSON the three cases are told apart, too.
+    assert gap.to_dict()["needs_context"] is False and unsure.to_dict()["needs_context"] is None
+    sure = context_gap(np.full(60, 10.0), np.full(60, -80.0), optimum_of(120.0))
+    assert sure.to_dict()["needs_context"] is True
     hopeless = context_gap(returns, returns, optimum_of(100.0))
     assert hopeless.gap is None and "not above that of random stimuli" in hopeless.to_text()
 

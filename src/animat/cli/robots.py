@@ -36,6 +36,8 @@ class Robots(Command):
             observed = ", ".join(f"{quantity['name']} ({quantity['unit']})" for quantity in robot["observes"])
             numbers = {k: f"{v:g}" if isinstance(v, float) else v for k, v in robot["parameters"].items()}
             parameters = " ".join(f"{key}={value}" for key, value in numbers.items())
+            if name.startswith("gymnasium:"):
+                parameters += ", and what gymnasium.make takes for it"
             print(f"{name}: {robot['is']}\n  observes {observed}\n  parameters {parameters}")
             if robot["commands"] > 1:
                 print(f"  takes {robot['commands']} commands: use that many --readouts, or --mapping none")
@@ -51,15 +53,19 @@ def _describe(name: str) -> dict[str, Any]:
     from animat.robots import robot_named, robot_to_dict
     from animat.robots.base import WITHOUT, lacking
     from animat.robots.checking import check_robot
+    from animat.robots.gymnasium import GymnasiumRobot
 
     robot = robot_named(name)
     if not is_ours(robot):
         check_robot(robot)
-    lacks = lacking(robot)
+    lacks, parameters = lacking(robot), robot_to_dict(robot)["parameters"]
+    if isinstance(robot, GymnasiumRobot):
+        # Its others are what was found in the environment.
+        parameters = {"episode_limit": robot.episode_limit, **dict(robot.settings)}
     return {
         "is": (type(robot).__doc__ or "").strip().partition("\n")[0],
         "observes": [{"name": quantity.name, "unit": quantity.unit} for quantity in robot.observation_spec],
-        "parameters": robot_to_dict(robot)["parameters"],
+        "parameters": parameters,
         "commands": robot.n_commands,
         "can": [name for name in WITHOUT if name not in lacks],
         "lacks": lacks,

@@ -179,6 +179,11 @@ class ContextGap:
         """Whether the gap surely exceeds `REFLEX_GAP`."""
         return self.gap is not None and self.gap.low > REFLEX_GAP
 
+    @property
+    def _is_reflex(self) -> bool:
+        """Whether the gap surely does not exceed `REFLEX_GAP`."""
+        return self.gap is not None and self.best_known is None and self.gap.high <= REFLEX_GAP
+
     def score(self, returns: Float64[np.ndarray, " policies"], optimum: Optimum | None) -> Interval | None:
         """The context score of policies, with its interval: 0 is the best coupling, 1 the optimum.
 
@@ -210,7 +215,7 @@ class ContextGap:
             "coupling": self.coupling,
             "coupling_standard_error": self.standard_error if np.isfinite(self.standard_error) else None,
             "context_gap": None if self.gap is None else self.gap.to_dict(),
-            "needs_context": self.needs_context,
+            "needs_context": self.needs_context or (False if self._is_reflex else None),
             "is_least": self.best_known is not None,
             "best_known": self.best_known,
         }
@@ -228,7 +233,7 @@ class ContextGap:
         text = f"{coupling}; context gap {least}{self.gap.value:.2f} ({self.gap.low:.2f} to {self.gap.high:.2f})"
         if known is not None:
             text += f", as the best known agent returns {known:.1f}"
-        if not self.needs_context and known is None and self.gap.high <= REFLEX_GAP:
+        if self._is_reflex:
             text += ": this task needs no more than a reflex"
         elif not self.needs_context:
             text += ": whether this task needs more than a reflex is not known"

@@ -92,12 +92,17 @@ class Optimum:
         runs = (self.monte_carlo, self.standard_error), (self.without_clock, self.without_clock_standard_error)
         return max((run for run in runs if not math.isnan(run[0])), default=(math.nan, math.nan))
 
-    def findings(self) -> tuple[Finding, ...]:
-        """A warning if the value and its controller's return differ by more than chance and the grid's error."""
-        return bracket_findings(self.value, self.grid_error, *self.achieved)
+    def findings(self, best: tuple[str, float] | None = None) -> tuple[Finding, ...]:
+        """A warning if the value and its controller's return differ by more than chance and the grid's error.
+
+        `best` is the name and the mean return of the best other agent, if there are others.
+        """
+        return bracket_findings(self.value, self.grid_error, *self.achieved, best)
 
 
-def bracket_findings(value: float, grid_error: float, monte_carlo: float, error: float) -> tuple[Finding, ...]:
+def bracket_findings(
+    value: float, grid_error: float, monte_carlo: float, error: float, best: tuple[str, float] | None = None
+) -> tuple[Finding, ...]:
     """A warning if a value and its controller's return differ by more than 3 of its `error` plus the grid's error."""
     difference, of_controller = value - monte_carlo, f"its controller's return {monte_carlo:.2f} +- {error:.2f}"
     # No warning for NaN, where the controller was not run.
@@ -108,6 +113,8 @@ def bracket_findings(value: float, grid_error: float, monte_carlo: float, error:
         "simulator are); use a higher resolution"
     )
     which = " differ: the optimal return lies between the two" if difference > 0 else too_coarse
+    if difference > 0 and best is not None and monte_carlo < best[1] < value:
+        which = f" differ: the optimal return lies between {best[1]:.2f}, the mean return of {best[0]}, and the value"
     message = f"the value {value:.2f} (grid {grid_error:.2f}) and {of_controller}{which}"
     return (Finding("optimum", "warning", message, difference),)
 

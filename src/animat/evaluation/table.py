@@ -217,7 +217,7 @@ def evaluate(
         controls: names of the controls to run; None: all.
         agents: of your own, by name: rows like those of the controls (docs/agents.md).
         optimum_resolution: of the grid for the optimal return in the same environment (`best_returns`; 1 in a study),
-            which takes seconds. The best coupling, which also takes seconds, is then among the controls. None: neither.
+            which takes seconds, or minutes with memory. The best coupling is then among the controls. None: neither.
         interventions: whether to run the policies with all interventions too (`animat.evaluation.interventions`).
         progress: updated after the policies and each control, during the optimum, and before each intervention.
 
@@ -280,8 +280,9 @@ def evaluate(
     if interventions:
         phase = in_phase(progress, "whose work it is")
         work = run_interventions(*trained.within(*within), networks, episodes=episodes, seed=seed, progress=phase)
-    for best in (optimum, net_optimum):
-        findings += () if best is None else tuple(best.findings())
+    reached = [(row.name, float(row.mean_returns.mean())) for row in rows if not row.changed]
+    findings += () if optimum is None else optimum.findings(max(reached, key=lambda each: each[1], default=None))
+    findings += () if net_optimum is None else net_optimum.findings()
     return Evaluation(
         robot=body.name,
         mapping=None if first.mapping is None else first.mapping.name,

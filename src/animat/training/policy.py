@@ -20,7 +20,7 @@ from animat.arguments import checked_arguments
 from animat.coding.decoder import expect_fit, expect_one_command
 from animat.coding.mapping import REGISTRY as MAPPINGS
 from animat.coding.mapping import Mapping, mapping_from_data, mapping_to_data
-from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch, in_file, shown
+from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch, expect_kind, in_file, shown
 from animat.goals.robot import body_and_goal, robot_of, without_goal
 from animat.neurons.history import INITIAL_HISTORY
 from animat.plain_file import expect_plain_file, is_absent, is_folder
@@ -217,6 +217,7 @@ class Policy:
 
     def act(self, observation: Float[np.ndarray, " observations"], rng: np.random.Generator) -> Action:
         """Draw an action for an observation in physical units."""
+        expect_kind("rng", rng, np.random.Generator, "a generator, such as np.random.default_rng(1)")
         if self.n_actions is None:
             mean, log_std = np.split(self.outputs(observation).astype(np.float64), 2)
             return _squash(mean + np.exp(np.clip(log_std, -5.0, 2.0)) * rng.standard_normal(len(mean)))
