@@ -560,5 +560,5 @@ def test_an_observation_that_is_not_finite_is_no_action(wrong: float) -> None:
 
 
 def test_an_action_is_drawn_from_a_generator_only() -> None:
-    with pytest.raises(InvalidArgument, match="rng: expected a generator, such as .*, got 0"):
+    with pytest.raises(InvalidArgument, match=r"rng: expected a generator, such as .*, got 0"):
         through_neurons().act(np.zeros(4), 0)  # type: ignore[arg-type]
