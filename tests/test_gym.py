@@ -576,3 +576,41 @@ def test_an_id_with_a_robot_takes_no_other() -> None:
         with pytest.raises(InvalidArgument, match="the id names the cartpole, got 'shuttle': use Animat/Robot-v0"):
             make("Animat/Cartpole-v0", robot="shuttle")
     assert gymnasium.make("Animat/Cartpole-v0", robot="cartpole").unwrapped.setup.environment.robot == Cartpole()
+
+
+GOAL = "drive cart_position in -0.5..0.5 m; avoid pole_angle outside -12..12 deg"
+
+
+def test_the_outcome_of_a_goal_is_told_at_the_end_of_an_episode() -> None:
+    """Against the same goal, judged by the observations of the whole episode."""
+    env = gymnasium.make("Animat/Cartpole-v0", goal=GOAL, episode_limit=15)
+    robot, found = env.unwrapped.setup.environment.robot, []
+    for seed in range(8):
+        seen, ended = [env.reset(seed=seed)[0]], False
+        while not ended:
+            observation, _, terminated, truncated, info = env.step(4 if seen[-1][2] > 0 else 0)
+            seen.append(observation)
+            ended = terminated or truncated
+            assert ("is_success" in info) == ended
+        expected = robot.outcome_of(np.array(seen))
+        assert info["is_success"] is bool(expected.succeeded)
+        np.testing.assert_allclose(info["satisfaction"], expected.satisfaction, rtol=1e-6)
+        assert info["margin"] == pytest.approx(float(expected.margin), rel=1e-6)
+        found.append(info["is_success"])
+    assert len({*found}) == 2
+
+
+def test_outcomes_in_a_vector_are_those_of_the_episodes_that_ended() -> None:
+    envs = gymnasium.make_vec("Animat/Cartpole-v0", 6, goal=GOAL, episode_limit=15)
+    envs.reset(seed=1)
+    told = 0
+    for _ in range(40):
+        *_, terminated, truncated, info = envs.step(np.full(6, 4))
+        ended = terminated | truncated
+        assert ("is_success" in info) == ended.any()
+        if ended.any():
+            np.testing.assert_array_equal(info["_is_success"], ended)
+            # A fall is no success.
+            assert not info["is_success"][terminated].any()
+            told += int(ended.sum())
+    assert told > 6

@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float32, Int64, UInt8, UInt32
 
 from animat.environment import Environment, State
 from animat.errors import InvalidArgument, expect_at_least, expect_kind, shown
-from animat.goals.robot import without_goal
+from animat.goals.robot import RobotWithGoal, without_goal
 from animat.gym.setup import set_up
 from animat.robots.base import capability
 from animat.robots.drawing import draw_robot
@@ -74,12 +74,12 @@ class CompiledAnimats:
 
     def _start(self, rng: np.random.Generator) -> Rows:
         """Rows of new episodes."""
-        start, _, _ = self._functions
+        start, *_ = self._functions
         return np.asarray(start(rng.integers(0, 2**32, len(self._shown), dtype=np.uint32)))
 
     def _step(self, rows: Rows, actions: Actions, rng: np.random.Generator) -> Rows:
         """Rows after an iteration of each."""
-        _, step, _ = self._functions
+        _, step, *_ = self._functions
         n, noise_size = len(rows), self.setup.environment.noise_size
         inputs = np.empty((n, 1 + noise_size), np.float32)
         inputs[:, 0] = actions
@@ -88,7 +88,7 @@ class CompiledAnimats:
 
     def _go_on_from(self, rows: Rows, begun: Flags) -> tuple[Any, Observations]:
         """Returns the `State` and the observations in the rows, as numpy copies, shape (environments, ...)."""
-        _, _, read = self._functions
+        _, _, read, _ = self._functions
         self._rows, (state, observations) = rows, read(rows)
         if self.render_mode is not None:
             self._commands = state.info["command"]
@@ -97,6 +97,14 @@ class CompiledAnimats:
             for i, observation in enumerate(of_robot):
                 self._shown[i] = [observation] if begun[i] else [*self._shown[i], observation]
         return state, observations
+
+    def _outcomes(self, after: State) -> dict[str, Any]:
+        """What each episode that ended achieved of the robot's goal; empty without a goal, and if none ended."""
+        *_, judge = self._functions
+        if judge is None or not np.logical_or(*after.ended).any():
+            return {}
+        outcome = jax.device_get(judge(after.robot))
+        return {"is_success": outcome.succeeded, "satisfaction": outcome.satisfaction, "margin": outcome.margin}
 
     def _pictures(self) -> tuple[UInt8[np.ndarray, "height width 3"], ...] | None:
         """Pictures of the robots as they are now; None without a render mode."""
@@ -110,13 +118,13 @@ class CompiledAnimats:
         )
 
     @cached_property
-    def _functions(self) -> tuple[Callable[..., Any], ...]:
+    def _functions(self) -> tuple[Any, ...]:
         return _compiled(self.setup.environment)
 
 
 @lru_cache(maxsize=64)
-def _compiled(environment: Environment[Any]) -> tuple[Callable[..., Any], ...]:
-    """Starts and steps, as rows, and the reading of rows."""
+def _compiled(environment: Environment[Any]) -> tuple[Any, ...]:
+    """Starts and steps, as rows, the reading of rows, and the outcome of episodes, if the robot has a goal."""
 
     def with_observation(state: State) -> tuple[State, Array]:
         return state, environment.observe(state)
@@ -152,7 +160,9 @@ def _compiled(environment: Environment[Any]) -> tuple[Callable[..., Any], ...]:
     def read(rows: Rows) -> tuple[Any, Observations]:
         return unpack(rows, np.ndarray.view)
 
-    return jax.jit(jax.vmap(start)), jax.jit(jax.vmap(step, (0, 0, None))), read
+    robot = environment.robot
+    judge = jax.jit(jax.vmap(robot.outcome)) if isinstance(robot, RobotWithGoal) else None
+    return jax.jit(jax.vmap(start)), jax.jit(jax.vmap(step, (0, 0, None))), read, judge
 
 
 class AnimatEnv(CompiledAnimats, gymnasium.Env[Float32[np.ndarray, " observations"], np.int64]):
@@ -163,7 +173,8 @@ class AnimatEnv(CompiledAnimats, gymnasium.Env[Float32[np.ndarray, " observation
     the robot's `episode_limit`, never both.
 
     `info` of a step: `delivered`, the condition that reached the neurons; `rate_hz`, their response (Hz per channel);
-    `command`, the motor command in [-1, 1] decoded from it. With several readouts the latter two are arrays.
+    `command`, the motor command in [-1, 1] decoded from it. With several readouts the latter two are arrays. At the end
+    of an episode with a goal also `is_success`, `satisfaction` (% of each objective) and `margin`.
 
     All random numbers come from the generator that `reset(seed=...)` seeds.
 
@@ -201,6 +212,7 @@ class AnimatEnv(CompiledAnimats, gymnasium.Env[Float32[np.ndarray, " observation
         after, observations = self._go_on_from(rows, np.zeros(1, bool))
         # Python numbers; arrays with several readouts.
         info = {name: value[0] if value.ndim > 1 else value[0].item() for name, value in after.info.items()}
+        info |= {name: value[0] if value.ndim > 1 else value[0].item() for name, value in self._outcomes(after).items()}
         terminated, truncated = (bool(each[0]) for each in after.ended)
         return observations[0], float(after.reward[0]), terminated, truncated, info
 
@@ -275,6 +287,8 @@ class AnimatVectorEnv(CompiledAnimats, VectorEnv[Observations, Actions, Rewards]
         self._ended = np.logical_or(*after.ended)
         info = after.info | {"delivered": after.info["delivered"].astype(np.int64)}
         info |= {f"_{name}": ~begun for name in info}
+        for name, value in self._outcomes(after).items():
+            info |= {name: value, f"_{name}": self._ended}
         return observations, after.reward, *after.ended, info
 
     def render(self) -> tuple[UInt8[np.ndarray, "height width 3"], ...] | None:
