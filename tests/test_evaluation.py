@@ -22,6 +22,7 @@ from animat.evaluation.table import evaluate
 from animat.neurons.simulator import fit_histogram, silenced
 from animat.neurons.synthetic import synthetic_simulator
 from animat.neurons.timeline import SimulatorTimeline, fit_timeline
+from animat.records import as_json
 from animat.robots import Cartpole, Navigation
 from animat.robots.base import Robot
 from animat.stimulation.protocol import Presentation
@@ -463,3 +464,18 @@ def test_a_different_presentation_or_window_is_reported() -> None:
     )
     evaluation = evaluate({"a": policy_of(timeline)}, other, episodes=50)
     assert [finding.name for finding in evaluation.findings] == ["other-window", "other-presentation"]
+
+
+@pytest.mark.parametrize("greedy", [True, False])
+def test_an_evaluation_says_how_it_was_made(greedy: bool) -> None:
+    timeline = timeline_of()
+    policy = policy_of(timeline, SHORT)
+    found = evaluate({"p0": policy}, timeline, episodes=7, seed=5, greedy=greedy, controls=["random"])
+    data = json.loads(json.dumps(as_json(found.to_dict())))
+    assert (data["seed"], data["actions"]) == (5, "most probable" if greedy else "drawn")
+    assert f"7 episodes each, {data['actions']} actions, seed 5" in found.to_text()
+    assert data["versions"]["numpy"] == np.__version__
+    for row, own in zip(data["rows"], found.rows, strict=True):
+        assert np.array(row["returns"]).shape == (1, 7)
+        assert np.mean(row["returns"]) == pytest.approx(row["mean_return"])
+        np.testing.assert_array_equal(row["returns"], own.episodes.returns)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
@@ -53,6 +54,8 @@ class Evaluation:
         objectives: of the robot's goal, as texts; empty for a robot without one.
         whose_work: what the policies lose with each intervention; None if it was not requested.
         net_optimum: the optimal return of any controller less the cost of pulses, if they have a cost.
+        seed: of all random draws.
+        greedy: whether policies took their most probable actions, or drew them as in training.
     """
 
     __repr__ = briefly
@@ -70,6 +73,8 @@ class Evaluation:
     objectives: tuple[str, ...] = ()
     whose_work: InterventionTable | None = None
     net_optimum: Optimum | None = None
+    seed: int = 1
+    greedy: bool = True
 
     @property
     def context_score(self) -> Interval | None:
@@ -102,15 +107,25 @@ class Evaluation:
         mean, at_random, best = float(row.mean_returns.mean()), float(random.mean_returns.mean()), self.optimum.value
         return normalised_score(mean, at_random, best) if best > at_random else None
 
+    @property
+    def _actions(self) -> str:
+        return "most probable" if self.greedy else "drawn"
+
     def to_dict(self) -> dict[str, Any]:
-        """Everything as plain data."""
+        """Everything as plain data, with the return of each episode."""
         return {
             "robot": self.robot,
             "mapping": self.mapping,
             "recorded_at_min": self.recorded_at_min,
             "percentiles_fixed_from_min": self.fixed_from_min,
+            "seed": self.seed,
+            "actions": self._actions,
+            "versions": {name: importlib.metadata.version(name) for name in ("animat", "jax", "numpy")},
             "policies": dict(zip(self.names, self.rows[0].mean_returns.tolist(), strict=True)),
-            "rows": [{**row.to_dict(), "normalised_score": self.score(row)} for row in self.rows],
+            "rows": [
+                {**row.to_dict(), "normalised_score": self.score(row), "returns": row.episodes.returns.tolist()}
+                for row in self.rows
+            ],
             "optimum": None if self.optimum is None else self.optimum.to_dict(),
             "no_optimum": self.no_optimum,
             "pulse_cost": self.rows[0].pulse_cost,
@@ -149,7 +164,8 @@ class Evaluation:
             numbers += ["" if score is None else f"{score:.2f}" for _ in score_head]
             cells.append([row.name, *numbers, row.meaning])
         policies, episodes = counted(len(first), "policy", "policies"), counted(first.shape[1], "episode")
-        lines = [f"{self.robot}, {on}: {policies}, {episodes} each", *align_columns(head, cells)]
+        how = f"{episodes} each, {self._actions} actions, seed {self.seed}"
+        lines = [f"{self.robot}, {on}: {policies}, {how}", *align_columns(head, cells)]
         each = ", ".join(f"{name} {x:.1f}" for name, x in zip(self.names, self.rows[0].mean_returns, strict=True))
         lines.append(f"  each policy: {each}")
         if cost:
@@ -297,6 +313,8 @@ def evaluate(
         objectives=objectives_of(body),
         whose_work=work,
         net_optimum=net_optimum,
+        seed=seed,
+        greedy=greedy,
     )
 
 
