@@ -14,6 +14,7 @@ import pytest
 
 from animat.closed_loop.agents import Greedy
 from animat.errors import InvalidArgument
+from animat.evaluation.own_agents import agents_at
 from animat.evaluation.rollouts import Actor
 from animat.evaluation.table import evaluate
 from animat.neurons.timeline import SimulatorTimeline, fit_timeline
@@ -146,3 +147,32 @@ def test_the_rules_of_the_page_are_one_rule() -> None:
     rule, in_jax = evaluate({"p0": policy}, timeline, controls=[], agents=agents).rows[1:]
     assert rule.episodes.returns.tolist() == in_jax.episodes.returns.tolist()
     assert rule.episodes.returns.mean() > 0
+
+
+def test_agents_are_imported_by_their_place_and_made_with_the_conditions(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "own_agents_of_a_test.py").write_text(
+        "class Rule:\n"
+        "    def __init__(self, conditions):\n"
+        "        self.last = len(conditions) - 1\n"
+        "    def act(self, observation, rng):\n"
+        "        return self.last\n"
+        "class Odd:\n"
+        "    def __init__(self):\n"
+        "        pass\n"
+        "ready = Rule((1, 2))\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    module, conditions = "own_agents_of_a_test", five_conditions().conditions
+    agents = agents_at([f"{module}:Rule", f"{module}:ready"], conditions)
+    assert [(name, agent.last) for name, agent in agents.items()] == [("Rule", 4), ("ready", 1)]
+    for places, message in (
+        ([f"{module}:Odd"], "to be created with the conditions to choose from, got TypeError"),
+        ([module], "expected a module and what is in it, such as my_rule:Rule, got 'own_agents_of_a_test'"),
+        ([f"{module}:Rule"] * 2, "expected different names, got 'own_agents_of_a_test:Rule'"),
+        ([f"{module}:Nothing"], "to be importable, got AttributeError"),
+        (["own_agents_of_a_test.py:Rule"], "such as own_agents_of_a_test:Rule, got a file"),
+    ):
+        with pytest.raises(InvalidArgument, match=message):
+            agents_at(places, conditions)

@@ -233,19 +233,7 @@ class Registry(Generic[Thing]):
         for kind in self._registered.values():
             if place_of(kind) == place:
                 return kind
-        noun, (module, _, name) = self.noun, place.partition(":")
-        if module.endswith(".py"):
-            meant = f"{Path(module).stem}:{name}"
-            raise InvalidArgument(
-                f"{noun}: expected a module and its class, such as {meant}, got a file, {shown(place)}"
-            )
-        try:
-            found: type[Thing] = getattr(importlib.import_module(module), name)
-        except InvalidArgument:
-            raise
-        except (Exception, SystemExit) as error:
-            # Anything may go wrong in a third-party module.
-            raise InvalidArgument(f"{noun}: expected {place} to be importable, got {first_line(error)}") from error
+        found: type[Thing] = imported(self.noun, place)
         self.register(found)
         return found
 
@@ -262,6 +250,21 @@ class Registry(Generic[Thing]):
 
 def _registry_of(base: type) -> Registry[Any]:
     return _registries[base]
+
+
+def imported(noun: str, place: str) -> Any:
+    """What is at a `module:Name`; InvalidArgument, which calls it a `noun`, if it cannot be imported."""
+    module, _, name = place.partition(":")
+    if module.endswith(".py"):
+        meant = f"{Path(module).stem}:{name}"
+        raise InvalidArgument(f"{noun}: expected a module and its class, such as {meant}, got a file, {shown(place)}")
+    try:
+        return getattr(importlib.import_module(module), name)
+    except InvalidArgument:
+        raise
+    except (Exception, SystemExit) as error:
+        # Anything may go wrong in a third-party module.
+        raise InvalidArgument(f"{noun}: expected {place} to be importable, got {first_line(error)}") from error
 
 
 def place_of(kind: type) -> str:

@@ -34,6 +34,8 @@ class Evaluate(SimulatorOptions):
     """The expected robot, with its import path: my_package.robots:Rover; default: the one they were trained on"""
     mapping: str | None = None
     """The expected mapping, with its import path: my_package.mappings:Steep; default: the one they were trained with"""
+    agents: tuple[str, ...] = ()
+    """Your own agents, which get rows too: my_rule:Rule (docs/agents.md)"""
     drawn: bool = False
     """Draw actions from the policy, as in training, instead of taking the most probable one"""
     optimum: bool = False
@@ -62,8 +64,10 @@ class Evaluate(SimulatorOptions):
         check_at_once("--episodes", self.episodes, len(policies))
         timeline = self.timeline_for(policies, self.recordings)
 
+        from animat.evaluation.own_agents import agents_at
         from animat.evaluation.table import evaluate
 
+        agents = agents_at(self.agents, next(iter(policies.values())).conditions)
         keep_compilations()
         with Bar("evaluating") as progress:
             evaluation = evaluate(
@@ -73,6 +77,7 @@ class Evaluate(SimulatorOptions):
                 episodes=self.episodes,
                 seed=self.seed,
                 greedy=not self.drawn,
+                agents=agents,
                 optimum_resolution=1.0 if self.optimum else None,
                 interventions=self.interventions,
                 progress=progress,

@@ -52,6 +52,8 @@ class Run(StimulationOptions):
     controls: Literal["all", "random", "coupling"] = "all"
     """all: random, constant, silent, shuffled and heuristic; random: only that one; coupling: all, and the best reflex,
     searched for on the simulator first, which takes a minute"""
+    agents: tuple[str, ...] = ()
+    """Your own agents, each with as many episodes as a policy: my_rule:Rule (docs/agents.md)"""
     interventions: bool = False
     """Also measure whose work it is: run the policies with random spikes in place of responses, with the stimuli of
     another episode, with the mapping turned round and, for a robot with several goals, with the goal switched in
@@ -82,12 +84,14 @@ class Run(StimulationOptions):
         from animat.closed_loop.loop import Loop
         from animat.closed_loop.session import expect_no_session
         from animat.compilation import keep_compilations
+        from animat.evaluation.own_agents import agents_at
         from animat.neurons.simulator import check_binning
         from animat.reality_gap import run_policies
         from animat.recordings.reading import read_recordings
 
         # Everything is checked before the culture is opened.
         policies, first = self._policies()
+        agents = agents_at(self.agents, first.conditions)
         fit = simulator_settings(first.fitted, self.simulator, self.bins, self.range_hz)
         if fit["kind"] in ("histogram", None):
             check_binning(fit["bins"], fit["range_hz"])
@@ -125,6 +129,7 @@ class Run(StimulationOptions):
                     with_controls=self.controls != "random",
                     with_coupling=self.controls == "coupling",
                     with_interventions=self.interventions,
+                    agents=agents,
                     greedy=not self.drawn,
                     seed=self.seed,
                     account=account,

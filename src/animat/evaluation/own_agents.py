@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any, Protocol, final
 
 import jax
@@ -11,9 +11,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from animat.environment import Environment
-from animat.errors import InvalidArgument, shown, some_of
+from animat.errors import InvalidArgument, first_line, shown, some_of
 from animat.evaluation.controls import Control
 from animat.evaluation.rollouts import Actor, Seen, Uniforms
+from animat.registry import imported
+from animat.responses.condition import Condition
 
 _GRID = 2**24
 """Uniforms of single precision are multiples of 1 / 2^24."""
@@ -82,3 +84,25 @@ def controls_of_own(agents: Mapping[str, Actor | Controller], taken: Collection[
             raise InvalidArgument(f"agents: {name}: expected one actor, got {actor.n_actors} side by side")
         controls.append(Control(name, "your own agent", actor))
     return controls
+
+
+def agents_at(places: Sequence[str], conditions: Sequence[Condition]) -> dict[str, Any]:
+    """Agents by where to import them from, `my_rule:Rule`; a class is made with the conditions to choose from.
+
+    Each is named as in its module. Raises InvalidArgument for one that cannot be imported or made, and for equal names.
+    """
+    agents: dict[str, Any] = {}
+    for place in places:
+        name = place.partition(":")[2]
+        if not name or name in agents:
+            expected = "a module and what is in it, such as my_rule:Rule" if not name else "different names"
+            raise InvalidArgument(f"agents: expected {expected}, got {shown(place)}")
+        agent = imported("agents", place)
+        if isinstance(agent, type):
+            try:
+                agent = agent(tuple(conditions))
+            except Exception as error:
+                how = "to be created with the conditions to choose from"
+                raise InvalidArgument(f"agents: expected {place} {how}, got {first_line(error)}") from error
+        agents[name] = agent
+    return agents
