@@ -16,6 +16,7 @@ from animat.cli import main
 from animat.closed_loop.session import recover_session
 from animat.coding.mapping import Thresholds
 from animat.cultures import under_way
+from animat.cultures.base import Culture
 from animat.cultures.budget import Account, Budget, record_within
 from animat.cultures.kinds import recorded_culture
 from animat.cultures.observed import Observed
@@ -613,3 +614,28 @@ def test_from_the_command_line_it_says_what_it_did_and_exits_as_the_loop_ended(
     printed_too = capsys.readouterr()
     assert "the session ended before its plan was completed: the culture raised DeviceFailed: gone" in printed_too.err
     assert printed_too.out.startswith("2 recordings in 10 min")
+
+
+def test_the_command_takes_a_protocol(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked: list[Protocol] = []
+
+    def stop(training: Training, culture: Culture, protocol: Protocol, *given: object, **settings: object) -> None:
+        asked.append(protocol)
+        raise DeviceFailed("enough")
+
+    monkeypatch.setattr("animat.live.shadowing.live", stop)
+    slow = tmp_path / "slow.json"
+    slow.write_text('{"frequencies_hz": [5, 40], "trials": 30, "patterns": 7}')
+    arguments = ["live", "--culture-seed", "1", "--out", str(tmp_path / "live")]
+    assert main([*arguments, "--protocol", str(slow)]) == 1
+    assert main([*arguments, "--trials", "20", "--pulses", "2"]) == 1
+    assert main(arguments) == 1
+    first, second, usual = asked
+    assert (first.frequencies_hz, first.trials, first.patterns, first.order) == ((5.0, 40.0), 30, 7, "mixed")
+    assert (second.trials, second.pulses, second.patterns) == (20, 2, 100)
+    assert (usual.order, usual.pulses, usual.trials, len(usual.frequencies_hz)) == ("mixed", 1, 500, 5)
+    capsys.readouterr()
+    assert main([*arguments, "--protocol", str(slow), "--trials", "20"]) == 1
+    assert "--protocol: expected it alone, got --trials too; put them in the file" in capsys.readouterr().err

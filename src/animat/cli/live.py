@@ -32,12 +32,15 @@ class Live(StimulationOptions):
     """A goal that replaces the robot's own task, as --goal of animat train"""
     policies: int = 4
     """Number of policies, each with its own random numbers"""
-    order: Literal["mixed", "blocked"] = "mixed"
-    """Order of the trials in recordings; a closed loop presents mixed trials"""
-    pulses: int = 1
-    """Pulses per trial; the response to the last one is read"""
-    trials: int = 500
-    """Trials of each frequency in a recording"""
+    order: Literal["mixed", "blocked"] | None = None
+    """Order of the trials in recordings; a closed loop presents mixed trials; default: mixed"""
+    pulses: int | None = None
+    """Pulses per trial; the response to the last one is read; default: 1"""
+    trials: int | None = None
+    """Trials of each frequency in a recording; default: 500"""
+    protocol: Path | None = None
+    """A JSON file that replaces these three, as for animat record, such as {"frequencies_hz": [5, 10, 20, 40]}; what it
+    leaves out has its default"""
     interval_min: float = 10.0
     """Minutes of the culture's clock from one recording to the next"""
     duration_min: float = 60.0
@@ -75,7 +78,7 @@ class Live(StimulationOptions):
         from animat.registry import is_ours
         from animat.robots.checking import check_robot
         from animat.robots.registry import robot_named
-        from animat.stimulation.protocol import Protocol
+        from animat.stimulation.protocol import Protocol, read_protocol
         from animat.training.specification import Training
 
         simulated = self.culture in ("virtual", "replay")
@@ -103,7 +106,12 @@ class Live(StimulationOptions):
             algorithm=read_sac(self.sac),
         )
         account = self._account()
-        protocol = Protocol(order=self.order, pulses=self.pulses, trials=self.trials, pulse=pulse_for(self.culture))
+        protocol = Protocol(order="mixed", trials=500, pulse=pulse_for(self.culture))
+        given = {name: value for name in ("order", "pulses", "trials") if (value := getattr(self, name)) is not None}
+        if given and self.protocol is not None:
+            options = ", ".join(f"--{name}" for name in given)
+            raise InvalidArgument(f"--protocol: expected it alone, got {options} too; put them in the file")
+        protocol = replace(protocol, **given) if self.protocol is None else read_protocol(self.protocol, protocol)
         settings = self._loop_settings()
         check_plan(training, protocol, self.out, timetable, self.episodes, settings, account)
         keep_compilations()
@@ -120,7 +128,7 @@ class Live(StimulationOptions):
             ran = live(
                 training,
                 culture,
-                replace(protocol, patterns=min(100, len(culture.patterns))),
+                replace(protocol, patterns=min(protocol.patterns, len(culture.patterns))),
                 self.out,
                 timetable=timetable,
                 episodes=self.episodes,
