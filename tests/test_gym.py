@@ -6,6 +6,7 @@ import copy
 import pickle
 import subprocess
 import sys
+import warnings
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -614,3 +615,17 @@ def test_outcomes_in_a_vector_are_those_of_the_episodes_that_ended() -> None:
             assert not info["is_success"][terminated].any()
             told += int(ended.sum())
     assert told > 6
+
+
+def test_a_step_after_the_end_is_warned_of_once_an_episode() -> None:
+    env = gymnasium.make("Animat/Cartpole-v0", episode_limit=3).unwrapped
+    for _ in range(2):
+        env.reset(seed=1)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            for _ in range(3):
+                env.step(0)
+        with pytest.warns(UserWarning, match=r"the episode has ended: call reset\(\)") as said:
+            env.step(0)
+            env.step(0)
+        assert len(said) == 1

@@ -193,6 +193,7 @@ class AnimatEnv(CompiledAnimats, gymnasium.Env[Float32[np.ndarray, " observation
         super().__init__(1, robot, robot_of_id, render_mode, options)
         self.observation_space = self.setup.observation_space
         self.action_space = self.setup.action_space
+        self._has_ended = self._was_warned = False
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -200,6 +201,7 @@ class AnimatEnv(CompiledAnimats, gymnasium.Env[Float32[np.ndarray, " observation
         """Start an episode; `options` are not used."""
         super().reset(seed=seed)
         _, observations = self._go_on_from(self._start(self.np_random), np.ones(1, bool))
+        self._has_ended = self._was_warned = False
         return observations[0], {}
 
     def step(self, action: np.int64) -> tuple[Float32[np.ndarray, " observations"], float, bool, bool, dict[str, Any]]:
@@ -208,12 +210,16 @@ class AnimatEnv(CompiledAnimats, gymnasium.Env[Float32[np.ndarray, " observation
         if not self.action_space.contains(action):
             last = len(self.setup.condition_labels) - 1
             raise InvalidArgument(f"action: expected a condition, a whole number from 0 to {last}, got {shown(action)}")
+        if self._has_ended and not self._was_warned:
+            gymnasium.logger.warn("step: the episode has ended: call reset(), as what follows has no meaning")
+            self._was_warned = True
         rows = self._step(rows, np.array([action]), self.np_random)
         after, observations = self._go_on_from(rows, np.zeros(1, bool))
         # Python numbers; arrays with several readouts.
         info = {name: value[0] if value.ndim > 1 else value[0].item() for name, value in after.info.items()}
         info |= {name: value[0] if value.ndim > 1 else value[0].item() for name, value in self._outcomes(after).items()}
         terminated, truncated = (bool(each[0]) for each in after.ended)
+        self._has_ended = self._has_ended or terminated or truncated
         return observations[0], float(after.reward[0]), terminated, truncated, info
 
     def render(self) -> UInt8[np.ndarray, "height width 3"] | None:
