@@ -11,6 +11,7 @@ import pytest
 
 from animat.cli import main
 from animat.cultures.base import Culture
+from animat.cultures.budget import Account, record_within
 from animat.cultures.devices.cl1 import CL1_PULSE, CL1Culture
 from animat.cultures.series import record_series
 from animat.cultures.under_way import UNDER_WAY, PartialRecording
@@ -211,3 +212,71 @@ def test_what_a_killed_run_left_is_kept_by_the_next(tmp_path: Path, monkeypatch:
     assert kept.spike_times_s.tolist() == recording.spike_times_s.tolist()
     assert kept.stimuli.electrodes.tolist() == recording.stimuli.electrodes.tolist()
     assert not list(tmp_path.glob(".*"))
+
+
+def test_a_fast_protocol_is_cut_too_and_little_observed_is_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
+    culture, run_on, *_ = on_maxone(monkeypatch)
+    protocol = Protocol(**vars(MIXED) | {"pulse": BALANCED_PULSE, "frequencies_hz": (20, 40), "trials": 2000})
+    cuts = 0
+
+    def follow(so_far: Callable[[], Recording]) -> None:
+        nonlocal cuts
+        cuts += 1
+        run_on(3.0)
+
+    with culture:
+        recording = culture.record(protocol, 1, follow=follow)
+    (finding,) = (each for each in recording.findings if each.name == "left-out")
+    assert cuts == 2 and finding.severity == "warning"
+    assert finding.value == pytest.approx(6 / recording.duration_s, rel=0.01)
+
+
+def test_what_a_killed_run_left_stays_where_it_cannot_be_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    culture, *_ = on_maxone(monkeypatch)
+    with culture:
+        recording = culture.record(Protocol(**vars(MIXED) | {"pulse": BALANCED_PULSE, "trials": 20}), 1)
+    PartialRecording(tmp_path)(lambda: recording)
+    (tmp_path / "interrupted").write_text("in the way")
+    with pytest.raises(InvalidFile, match="interrupted: expected a folder"), PartialRecording(tmp_path, is_kept=True):
+        pass
+    assert (tmp_path / UNDER_WAY).exists()
+    # Numbers are not used twice.
+    (tmp_path / "interrupted").unlink()
+    for _ in range(3):
+        PartialRecording(tmp_path)(lambda: recording)
+        with PartialRecording(tmp_path, is_kept=True):
+            pass
+    names = [file.name for file in sorted((tmp_path / "interrupted").iterdir())]
+    assert names == [f"recording_0000_min{n}.nwb" for n in ("", "_2", "_3")]
+    (tmp_path / "interrupted" / names[0]).unlink()
+    PartialRecording(tmp_path)(lambda: recording)
+    with PartialRecording(tmp_path, is_kept=True):
+        pass
+    assert sorted(file.name for file in (tmp_path / "interrupted").iterdir()) == names
+
+
+@pytest.mark.parametrize("device", [on_cl1, on_maxone])
+@pytest.mark.parametrize("fails_at", [1, 2, 3])
+@pytest.mark.parametrize("is_admitted", [False, True])
+def test_a_budget_counts_all_of_a_block_that_had_begun(
+    device: Callable, fails_at: int, is_admitted: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    culture, _, pulsed, rate_hz = device(monkeypatch)
+    protocol = Protocol(**vars(MIXED) | {"pulse": CL1_PULSE if rate_hz == 25_000 else BALANCED_PULSE})
+    account, calls, deliver = Account(), list[int](), type(culture)._deliver
+
+    def fail(self: Culture, admitted: object, duration_s: float) -> object:
+        calls.append(1)
+        if len(calls) == fails_at:
+            raise RuntimeError("a broken cable") if is_admitted else KeyboardInterrupt
+        return deliver(self, admitted, duration_s)  # type: ignore[arg-type]
+
+    with culture:
+        (block,) = culture.schedule(protocol, 1).blocks
+        monkeypatch.setattr(type(culture), "_deliver", fail)
+        with pytest.raises((DeviceFailed, KeyboardInterrupt)):
+            record_within(account, culture, protocol, 1)
+    delivered = [len(stretch.stimuli) for stretch in block.stretches(60.0, 0.1)]
+    assert len(pulsed()) == sum(delivered[: fails_at - 1])
+    # No less than what came: the stretch that failed may have been delivered, too.
+    assert account.pulses == len(block.stimuli) >= sum(delivered[:fails_at])

@@ -119,6 +119,11 @@ def test_a_recording_that_is_empty_from_some_time_on_causes_a_warning(duration_s
     assert "end earlier" not in said(poisson([(400, 600)]))["silence"]
 
 
+def test_pauses_between_stretches_of_stimulation_are_no_silences() -> None:
+    """A culture that fires only when it is stimulated: five times 20 s, and pauses of 130 s."""
+    assert "silence" not in said(poisson([(20.0 + 150 * i, 150.0 * (i + 1)) for i in range(5)], 750.0))
+
+
 @pytest.mark.parametrize("n_bursts", [1, 2, 3, 5, 20])
 def test_a_culture_that_fires_only_in_bursts_is_not_silent(n_bursts: int) -> None:
     rng = np.random.default_rng(n_bursts)

@@ -264,7 +264,7 @@ def test_a_value_that_its_controller_does_not_reach_is_reported() -> None:
     (above,) = bracket_findings(100.0, 0.5, 97.9, 0.5)
     assert "between the two" in above.message and above.value == pytest.approx(2.1)
     (known,) = bracket_findings(100.0, 0.5, 90.0, 0.5, ("heuristic", 95.0))
-    assert known.message.endswith("lies between 95.00, the mean return of heuristic, and the value")
+    assert known.message.endswith("lies between 95.00, which heuristic reaches, and the value")
     for no_better in (("random", 89.0), ("lucky", 101.0)):
         (known,) = bracket_findings(100.0, 0.5, 90.0, 0.5, no_better)
         assert known.message.endswith("lies between the two")

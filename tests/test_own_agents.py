@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +42,22 @@ class Falling(Actor):
         return jnp.where(observation[:, 2] > 0, 4, 0)
 
 
+@jax.tree_util.register_static
+@dataclass(frozen=True)
+class Always(Actor):
+    index: float
+
+    def act(self, environment: Any, observation: Any, uniforms: Any) -> Any:
+        return jnp.full(len(observation), self.index)
+
+
+@jax.tree_util.register_static
+@dataclass(frozen=True)
+class Misshaped(Actor):
+    def act(self, environment: Any, observation: Any, uniforms: Any) -> Any:
+        return observation @ jnp.zeros((7, 5))
+
+
 class Plain:
     def act(self, observation: np.ndarray, rng: np.random.Generator) -> Any:
         return np.int64(4) if observation[2] > 0 else 0
@@ -57,7 +73,7 @@ class Wrong:
         self.chosen = chosen
 
     def act(self, observation: np.ndarray, rng: np.random.Generator) -> object:
-        if isinstance(self.chosen, Exception):
+        if isinstance(self.chosen, BaseException):
             raise self.chosen
         return self.chosen
 
@@ -89,6 +105,13 @@ def test_an_agent_outside_jax_is_evaluated_as_one_in_jax_and_a_policy_as_itself(
         ("mine", Wrong(17), "agents: mine: InvalidArgument: act: expected the index of .* from 0 to 4, got 17"),
         ("mine", Wrong(0.5), "whole number from 0 to 4, got 0.5"),
         ("mine", Wrong(None), "whole number from 0 to 4, got None"),
+        # A closed loop refuses it, too.
+        ("mine", Wrong(2.0), "whole number from 0 to 4, got 2.0"),
+        ("mine", Wrong(SystemExit(3)), "agents: mine: SystemExit: 3"),
+        ("mine", Always(99), "agents: mine: act: expected .* whole number from 0 to 4, got 99"),
+        ("mine", Always(-3), "whole number from 0 to 4, got -3"),
+        ("mine", Always(1.0), "whole number from 0 to 4, got 1.0|to act in JAX, got TypeCheckError"),
+        ("mine", Misshaped(), "agents: mine: expected it to act in JAX, got"),
         ("mine", Wrong(ZeroDivisionError("no")), "agents: mine: ZeroDivisionError: no"),
         ("mine", 3, "agents: mine: expected an Actor, or a method `act`, got 3"),
         ("random", Plain(), "agents: expected names other than .*, got random"),
@@ -176,3 +199,18 @@ def test_agents_are_imported_by_their_place_and_made_with_the_conditions(
     ):
         with pytest.raises(InvalidArgument, match=message):
             agents_at(places, conditions)
+
+
+def test_an_agent_sees_the_neurons_if_the_policies_do() -> None:
+    timeline = fit_timeline([answers([60] * 5, 1)], kind="memory")
+    robot = Cartpole(episode_limit=20)
+    seeing = replace(
+        policy_of(timeline, robot),
+        neural_observation=True,
+        weights=(np.ones((6, 16), np.float32), *policy_of(timeline, robot).weights[1:]),
+        scales=np.ones(6, np.float32),
+    )
+    found = evaluate({"p0": seeing}, timeline, episodes=20, controls=[], agents={"it": Greedy(seeing), "rule": Plain()})
+    assert found.rows[1].episodes.returns.tolist() == found.rows[0].episodes.returns.tolist()
+    with pytest.raises(InvalidArgument, match="expected one that sees the robot only, got one with neural_observation"):
+        evaluate({"p0": policy_of(timeline, robot)}, timeline, agents={"it": Greedy(seeing)})

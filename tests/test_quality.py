@@ -353,9 +353,13 @@ def test_a_sampling_rate_in_khz_causes_a_warning(rate_hz: float, is_wrong: bool)
 def test_positions_in_another_unit_cause_a_warning(unit: float, is_wrong: bool) -> None:
     source = recording([(t, c) for t in range(1, 20) for c in range(16)], np.arange(1.0, 19.0), 16, 30.0)
     x_um, y_um = np.divmod(np.arange(16), 4)
+    rng_line = np.random.default_rng(1).normal(size=16)
     channels = replace(source.channels, x_um=unit * 100.0 * x_um, y_um=unit * 100.0 * y_um)
-    found = {each.name for each in recording_findings(replace(source, channels=channels))}
-    assert ("positions-not-in-um" in found) == is_wrong
+    # A linear probe, turned by a right angle.
+    line = replace(source.channels, x_um=1e-14 * rng_line, y_um=unit * 100.0 * np.arange(16))
+    for table in (channels, line):
+        found = {each.name for each in recording_findings(replace(source, channels=table))}
+        assert ("positions-not-in-um" in found) == is_wrong
 
 
 def test_a_single_unit_that_is_refractory_has_no_coarse_times() -> None:

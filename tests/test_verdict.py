@@ -76,5 +76,9 @@ def test_controls_are_outperformed_only_if_the_exact_p_is_small_too(ours: list[f
     assert not found.is_outperformed or (found.p_exact < 0.01 and found.has_enough_episodes and found.wins > 0.5)
 
 
-def test_twelve_episodes_against_three_are_enough() -> None:
-    assert str(Verdict.of([120.0] * 12, {"a": [-80.0] * 3})).startswith("these policies outperform every control")
+@pytest.mark.parametrize(("ours", "theirs"), [(12, 3), (5, 5)])
+def test_enough_episodes_that_are_all_larger_outperform_a_control(ours: int, theirs: int) -> None:
+    """Also without ties, where the approximation has p = 0.011 and 0.012."""
+    for spread in (0.0, 1.0):
+        verdict = Verdict.of(100 + spread * np.arange(ours), {"a": spread * np.arange(theirs)})
+        assert str(verdict).startswith("these policies outperform every control (p < 0.01; ")

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Float64
 from animat.environment import Animat, Environment
 from animat.errors import InvalidArgument, shown
 from animat.evaluation.controls import RANDOM, Control, Delivered
-from animat.evaluation.own_agents import Called, Controller
+from animat.evaluation.own_agents import Called, Controller, sees_neurons
 from animat.evaluation.rollouts import Actor, Constant, Networks, Uniform
 
 
@@ -114,9 +114,7 @@ class Agent:
 
     def sees_neurons(self, turn: int) -> bool:
         """Whether the controller of its episode number `turn` also sees the history state."""
-        controller = self.acting(turn)
-        policy = controller.policy if isinstance(controller, Greedy) else controller
-        return bool(getattr(policy, "neural_observation", False))
+        return sees_neurons(self.acting(turn))
 
     def acting(self, turn: int) -> Controller:
         """The controller of the agent's episode number `turn`, counted from 0."""

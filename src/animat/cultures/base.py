@@ -38,7 +38,7 @@ _BEFORE_ALL = ("__getattribute__", "__setattr__", "__delattr__", "__copy__", "__
 _REPLACEABLE = ("__init__", "left_out", "device", "recorded_as", "stretch_s")
 """What a backend may override although it is not abstract."""
 _GAP_ON_DEVICE_S = 0.1
-"""Shortest gap between two pulses in which a block is cut on a device, whose clock runs on meanwhile."""
+"""Gap between two pulses in which a block is cut on a device, whose clock runs on meanwhile, if there are any."""
 
 
 class Culture(Openable):
@@ -246,6 +246,10 @@ class Culture(Openable):
         start_min, rate_hz, before = self.now_s / 60, self.sampling_rate_hz, self.left_out
         parts = list[tuple[Block, Observed]]()
         followed_s = unobserved_s = 0.0
+        gap_s = SHORTEST_GAP_S
+        # A clock that stands still between calls needs no gap to make up for.
+        if self.device is not None:
+            gap_s = max(gap_s, min(_GAP_ON_DEVICE_S, max(1 / hz for hz in protocol.frequencies_hz)))
 
         def so_far() -> Recording:
             blocks, observed = zip(*parts, strict=True)
@@ -257,8 +261,6 @@ class Culture(Openable):
             )
             return replace(recorded, provenance={**provenance, **lacks}, findings=findings)
 
-        # A clock that stands still between calls needs no gap to make up for.
-        gap_s = SHORTEST_GAP_S if self.device is None else _GAP_ON_DEVICE_S
         for done, block in enumerate(schedule.blocks):
             self.rest(max(0.0, block.setup_s - followed_s))
             stretches = (block,) if self.stretch_s is None else block.stretches(self.stretch_s, gap_s)

@@ -106,7 +106,7 @@ def record_within(
 ) -> Recording:
     """Record by a protocol, as `Culture.record` does; raises `BudgetSpent` unless the budget covers all of it.
 
-    If a recording fails half way, only what it had handed to the culture is spent.
+    If a recording fails half way, only the blocks that it had handed to the culture are spent, the last one as a whole.
     """
     schedule = culture.schedule(protocol, seed)
     by_block = [schedule.deliveries(block) for block in schedule.blocks]

@@ -37,7 +37,9 @@ def shortfalls(
         lost = Counter[str]()
         for what, count in left_out.items():
             lost["frames" if what.startswith("frames") else "spikes"] += count
-        share = max(lost["frames"] / n_frames, lost["spikes"] / max(1, lost["spikes"] + n_spikes))
+        share = max(
+            (lost["frames"] + rate_hz * unobserved_s) / n_frames, lost["spikes"] / max(1, lost["spikes"] + n_spikes)
+        )
         message = f"the device reported, or should have, what the recording lacks: {', '.join(lacks)}"
         yield Finding("left-out", "warning" if share > LOST_SHARE else "note", message, share)
     delays_s = [observed.stimulus_time_s - block.stimuli.time_s for block, observed in parts]

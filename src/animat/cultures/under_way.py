@@ -5,13 +5,14 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from itertools import chain, count
 from pathlib import Path
 from tempfile import mkdtemp
 from typing import Self
 
 import numpy as np
 
-from animat.errors import AnimatError, counted
+from animat.errors import AnimatError, InvalidFile, counted
 from animat.recordings.columns import columns_of
 from animat.recordings.formats.nwb import recording_name, write_nwb
 from animat.recordings.reading import read_recording
@@ -45,8 +46,11 @@ class PartialRecording:
     def __enter__(self) -> Self:
         if self._is_kept and self._path.exists():
             # That of a run that was killed.
+            left = None
             with suppress(AnimatError):
-                _keep(read_recording(self._path), self._path.parent / INTERRUPTED)
+                left = read_recording(self._path)
+            if left is not None:
+                _keep(left, self._path.parent / INTERRUPTED)
         self.remove()
         return self
 
@@ -64,13 +68,12 @@ class PartialRecording:
         self.remove()
         if error is None or self._so_far is None or not self._is_kept:
             return
-        recording = self._so_far()
         with suppress(Exception):
-            error.add_note(_keep(recording, self._path.parent / INTERRUPTED))
+            error.add_note(_keep(self._so_far(), self._path.parent / INTERRUPTED))
             return
         # A full disk may be why.
         with suppress(Exception):
-            error.add_note(_keep(recording, Path(mkdtemp(prefix="animat-"))))
+            error.add_note(_keep(self._so_far(), Path(mkdtemp(prefix="animat-"))))
             return
         error.add_note("and then: what was recorded so far could not be kept")
 
@@ -90,11 +93,14 @@ class PartialRecording:
 
 
 def _keep(recording: Recording, folder: Path) -> str:
-    """Write a recording that was cut short; returns what to tell the user."""
+    """Write a recording that was cut short; returns what to tell the user. Raises InvalidFile if that fails."""
     name = Path(recording_name(round(recording.start_min, 3)))
-    taken = len(list(folder.glob(f"{name.stem}*")))
-    file = folder / (f"{name.stem}_{taken + 1}{name.suffix}" if taken else name)
-    folder.mkdir(exist_ok=True)
+    numbered = (folder / f"{name.stem}_{number}{name.suffix}" for number in count(2))
+    file = next(each for each in chain([folder / name], numbered) if not each.exists())
+    try:
+        folder.mkdir(exist_ok=True)
+    except OSError as error:
+        raise InvalidFile(f"{folder}: expected a folder for recordings that were cut short, got {error}") from error
     try:
         write_nwb(recording, file)
     except BaseException:

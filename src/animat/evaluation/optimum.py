@@ -95,7 +95,7 @@ class Optimum:
     def findings(self, best: tuple[str, float] | None = None) -> tuple[Finding, ...]:
         """A warning if the value and its controller's return differ by more than chance and the grid's error.
 
-        `best` is the name and the mean return of the best other agent, if there are others.
+        `best` is the name of the best other agent, and what it returns at least, if there are others.
         """
         return bracket_findings(self.value, self.grid_error, *self.achieved, best)
 
@@ -114,7 +114,7 @@ def bracket_findings(
     )
     which = " differ: the optimal return lies between the two" if difference > 0 else too_coarse
     if difference > 0 and best is not None and monte_carlo < best[1] < value:
-        which = f" differ: the optimal return lies between {best[1]:.2f}, the mean return of {best[0]}, and the value"
+        which = f" differ: the optimal return lies between {best[1]:.2f}, which {best[0]} reaches, and the value"
     message = f"the value {value:.2f} (grid {grid_error:.2f}) and {of_controller}{which}"
     return (Finding("optimum", "warning", message, difference),)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import operator
+import threading
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any, Protocol, final
 
@@ -10,12 +12,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from animat.environment import Environment
-from animat.errors import InvalidArgument, first_line, shown, some_of
+from animat.environment import Environment, Neurons
+from animat.errors import InvalidArgument, first_line, shown, some_of, within
 from animat.evaluation.controls import Control
-from animat.evaluation.rollouts import Actor, Seen, Uniforms
+from animat.evaluation.rollouts import Actor, Seen, Uniforms, trace
 from animat.registry import imported
 from animat.responses.condition import Condition
+from animat.robots.host import HostRobot
 
 _GRID = 2**24
 """Uniforms of single precision are multiples of 1 / 2^24."""
@@ -38,30 +41,30 @@ class Called(Actor):
 
     def __init__(self, name: str, controller: Controller) -> None:
         self.name, self.controller = name, controller
-        self._failure: Exception | None = None
+        self._failure: BaseException | None = None
+        self._lock = threading.Lock()
 
     def act(self, environment: Environment[Any], observation: Seen, uniforms: Uniforms) -> Array:
-        n, seen = environment.n_actions, observation * environment.scales
-        if not getattr(self.controller, "neural_observation", False):
+        n, seen = environment.n_actions or 0, observation * environment.scales
+        if not sees_neurons(self.controller):
             seen = seen[:, : len(environment.robot.observation_spec)]
 
         def choose(observation: np.ndarray, uniforms: np.ndarray) -> np.ndarray:
-            return np.array([self._choose(*each, n) for each in zip(observation, uniforms, strict=True)], np.int32)
+            # A prediction uses several threads, which the controller need not know.
+            with self._lock:
+                return np.array([self._choose(*each, n) for each in zip(observation, uniforms, strict=True)], np.int32)
 
         chosen = jax.ShapeDtypeStruct(observation.shape[:1], jnp.int32)
         called: Array = jax.pure_callback(choose, chosen, seen, uniforms[:, 0], vmap_method="sequential")
         return called
 
-    def _choose(self, observation: np.ndarray, uniform: float, n_actions: int | None) -> int:
+    def _choose(self, observation: np.ndarray, uniform: float, n_actions: int) -> int:
         if self._failure is not None:
             return 0
         try:
-            chosen = self.controller.act(np.asarray(observation), np.random.default_rng(int(uniform * _GRID)))
-            if n_actions is None or chosen not in range(n_actions):
-                which = "a condition" if n_actions is None else f"a condition, a whole number from 0 to {n_actions - 1}"
-                raise InvalidArgument(f"act: expected the index of {which}, got {shown(chosen)}")
-            return int(chosen)
-        except Exception as error:
+            chosen = self.controller.act(np.array(observation), np.random.default_rng(int(uniform * _GRID)))
+            return _expect_condition(chosen, n_actions)
+        except (Exception, SystemExit) as error:
             self._failure = error
             return 0
 
@@ -71,19 +74,63 @@ class Called(Actor):
             raise InvalidArgument(f"agents: {self.name}: {type(failure).__name__}: {failure}") from failure
 
 
-def controls_of_own(agents: Mapping[str, Actor | Controller], taken: Collection[str]) -> list[Control]:
-    """Agents of one's own as controls; InvalidArgument for one that cannot act, or whose name is `taken`."""
+def sees_neurons(controller: Controller) -> bool:
+    """Whether a controller, or the policy that it makes greedy, also observes the neurons' history state."""
+    return bool(getattr(getattr(controller, "policy", controller), "neural_observation", False))
+
+
+def controls_of_own(
+    agents: Mapping[str, Actor | Controller], environment: Environment[Any], simulator: Neurons, taken: Collection[str]
+) -> list[Control]:
+    """Agents of one's own as controls.
+
+    Raises InvalidArgument for one that cannot act in this environment, tried for some episodes if it is in JAX, and for
+    a name that is `taken`.
+    """
+    if agents and environment.n_actions is None:
+        raise InvalidArgument("agents: expected none, as these policies choose from no conditions, got some")
     controls = []
     for name, agent in agents.items():
         if name in taken:
             raise InvalidArgument(f"agents: expected names other than {some_of(sorted(taken))}, got {name}")
         if not callable(getattr(agent, "act", None)):
             raise InvalidArgument(f"agents: {name}: expected an Actor, or a method `act`, got {shown(agent)}")
+        if isinstance(agent, Actor):
+            _try(name, agent, environment, simulator)
+        elif sees_neurons(agent) and len(environment.observation_spec) == len(environment.robot.observation_spec):
+            got = "one with neural_observation, which these policies do not have"
+            raise InvalidArgument(f"agents: {name}: expected one that sees the robot only, got {got}")
         actor = agent if isinstance(agent, Actor) else Called(name, agent)
-        if actor.n_actors != 1:
-            raise InvalidArgument(f"agents: {name}: expected one actor, got {actor.n_actors} side by side")
         controls.append(Control(name, "your own agent", actor))
     return controls
+
+
+def _try(name: str, actor: Actor, environment: Environment[Any], simulator: Neurons) -> None:
+    """Raise InvalidArgument for an actor that raises, or whose actions, which JAX would not refuse, are none."""
+    if actor.n_actors != 1:
+        raise InvalidArgument(f"agents: {name}: expected one actor, got {actor.n_actors} side by side")
+    if isinstance(environment.robot, HostRobot):
+        return
+    try:
+        actions = trace(environment, simulator, actor, episodes=8, seed=1).actions
+        found = np.unique(actions).tolist()
+    except Exception as error:
+        raise InvalidArgument(f"agents: {name}: expected it to act in JAX, got {first_line(error)}") from error
+    for action in found:
+        with within(f"agents: {name}"):
+            _expect_condition(action, environment.n_actions or 0)
+
+
+def _expect_condition(chosen: Any, n: int) -> int:
+    """The chosen index as a plain number, by the same rule as in a closed loop."""
+    try:
+        index = operator.index(chosen)
+    except TypeError:
+        index = -1
+    if not 0 <= index < n:
+        expected = f"the index of a condition, a whole number from 0 to {n - 1}"
+        raise InvalidArgument(f"act: expected {expected}, got {shown(chosen)}")
+    return index
 
 
 def agents_at(places: Sequence[str], conditions: Sequence[Condition]) -> dict[str, Any]:
@@ -103,6 +150,7 @@ def agents_at(places: Sequence[str], conditions: Sequence[Condition]) -> dict[st
                 agent = agent(tuple(conditions))
             except Exception as error:
                 how = "to be created with the conditions to choose from"
-                raise InvalidArgument(f"agents: expected {place} {how}, got {first_line(error)}") from error
+                got = f"{first_line(error)}: name an instance of it instead"
+                raise InvalidArgument(f"agents: expected {place} {how}, got {got}") from error
         agents[name] = agent
     return agents

@@ -253,19 +253,24 @@ class EpisodeComparison(NamedTuple):
         p: of the two-sided Mann-Whitney test (normal approximation).
         wins: share of pairs of episodes in which the policies' return is larger, ties half.
         policies, control: number of episodes.
-        p_exact: of the same test, over all ways to divide the episodes; 0 if there are too many of them to count.
+        p_exact: of the same test, over all ways to divide the episodes; None if there are too many of them to count.
     """
 
     p: float
     wins: float
     policies: int
     control: int
-    p_exact: float = 0.0
+    p_exact: float | None = None
+
+    @property
+    def p_best(self) -> float:
+        """The exact p, or else the approximate one."""
+        return self.p if self.p_exact is None else self.p_exact
 
     @property
     def is_outperformed(self) -> bool:
         """Whether the policies' returns are larger than the control's, in enough episodes to show it."""
-        return max(self.p, self.p_exact) < OUTPERFORMED_P and self.wins > 0.5 and self.has_enough_episodes
+        return self.p_best < OUTPERFORMED_P and self.wins > 0.5 and self.has_enough_episodes
 
     @property
     def has_enough_episodes(self) -> bool:
@@ -277,7 +282,7 @@ def compare_episodes(policies: ArrayLike, control: ArrayLike) -> EpisodeComparis
     """Compare the returns (at least one, any shape) of all policies together with those of a control, by episodes."""
     ours, theirs = np.ravel(policies), np.ravel(control)
     u, p = mann_whitney(ours, theirs)
-    p_exact = _exact_p(ours, theirs) if len(ours) * len(theirs) <= _MOST_EPISODE_PAIRS else 0.0
+    p_exact = _exact_p(ours, theirs) if len(ours) * len(theirs) <= _MOST_EPISODE_PAIRS else None
     return EpisodeComparison(p, u / len(ours) / len(theirs), len(ours), len(theirs), p_exact)
 
 
@@ -305,8 +310,8 @@ class Verdict:
     def __str__(self) -> str:
         few = {name: each for name, each in self.controls.items() if not each.has_enough_episodes}
         not_outperformed = [
-            f"{name} (p = {each.p:.2g}; {'they are worse: ' if is_worse(each.p, each.wins) else ''}their return is "
-            f"larger in {100 * each.wins:.0f} % of the pairs of episodes, ties counting half)"
+            f"{name} (p = {each.p_best:.2g}; {'they are worse: ' if is_worse(each.p_best, each.wins) else ''}their "
+            f"return is larger in {100 * each.wins:.0f} % of the pairs of episodes, ties counting half)"
             for name, each in self.controls.items()
             if not each.is_outperformed and each.has_enough_episodes
         ]

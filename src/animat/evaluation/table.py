@@ -268,7 +268,7 @@ def evaluate(
         if unknown := sorted({*controls} - {*known, "heuristic", "coupling"}):
             raise InvalidArgument(f"controls: expected some of {', '.join(known)}, got {', '.join(unknown)}")
     acting = [trained, *(control for control in all_controls if controls is None or control.name in controls)]
-    acting += controls_of_own(agents or {}, ["policies", "coupling", *(each.name for each in all_controls)])
+    acting += controls_of_own(agents or {}, *within, ["policies", "coupling", *(each.name for each in all_controls)])
     wants_coupling = optimum_resolution is not None and (controls is None or "coupling" in controls)
     searches = wants_coupling and not isinstance(body, HostRobot)
     steps = len(acting) + searches
@@ -296,8 +296,11 @@ def evaluate(
     if interventions:
         phase = in_phase(progress, "whose work it is")
         work = run_interventions(*trained.within(*within), networks, episodes=episodes, seed=seed, progress=phase)
-    reached = [(row.name, float(row.mean_returns.mean())) for row in rows if not row.changed]
-    findings += () if optimum is None else optimum.findings(max(reached, key=lambda each: each[1], default=None))
+    if optimum is not None:
+        # Less their chance; conditions that the optimum leaves out would not count.
+        reached = [row for row in rows if not row.changed and not optimum.left_out]
+        best = max(reached, key=lambda row: row.mean_returns.mean(), default=None)
+        findings += optimum.findings(None if best is None else best.at_least)
     findings += () if net_optimum is None else net_optimum.findings()
     return Evaluation(
         robot=body.name,

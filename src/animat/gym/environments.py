@@ -58,7 +58,7 @@ class CompiledAnimats:
         self.render_mode = render_mode
         if (step_s := getattr(without_goal(self.setup.environment.robot), "step_s", None)) is not None:
             # Films are then in real time.
-            self.metadata = {**self.metadata, "render_fps": round(1 / step_s)}
+            self.metadata = {**self.metadata, "render_fps": max(1, round(1 / step_s))}
         self._rows: Rows | None = None
         self._shown: list[list[Float32[np.ndarray, " observations"]]] = [[] for _ in range(n)]
         self._commands: Float32[np.ndarray, "environments *commands"]

@@ -138,7 +138,7 @@ class Row:
             "predicted_net": self.predicted_net,
             "bursts": self.bursts,
             "late": self.late,
-            "p": None if self.comparison is None else self.comparison.p,
+            "p": None if self.comparison is None else self.comparison.p_best,
             "wins": None if self.comparison is None else self.comparison.wins,
             **self.met,
         }

@@ -164,7 +164,7 @@ def run_policies(
         actuator, *changed = interventions_of(environment, simulator, networks, switch_at=half_way)
         ideal = actuator, actuator.run(environment, simulator, **simulated).returns.ravel()
         controls += [each for each in changed if each.name not in ("silent", "shuffled")]
-    own = controls_of_own(agents or {}, [*policies, *(control.name for control in controls)])
+    own = controls_of_own(agents or {}, environment, simulator, [*policies, *(control.name for control in controls)])
     acting = {name: Greedy(policy) if greedy else policy for name, policy in policies.items()}
     pooled = np.concatenate(calibration.responses_hz)
     taking_turns = [Agent(name, trained.meaning, controller) for name, controller in acting.items()]

@@ -154,7 +154,7 @@ class RealityGap:
             if (gap := fields["gap"]) is not None:
                 ends = "unknown" if gap["low"] is None else f"{gap['low']:+z.1f} to {gap['high']:+z.1f}"
                 measured = [f"{fields['measured']:.1f}", f"{gap['value']:+z.1f}", ends]
-            p = "" if row.comparison is None else f"{row.comparison.p:.2g}"
+            p = "" if row.comparison is None else f"{row.comparison.p_best:.2g}"
             counts = [
                 *(cells_of(row.met) if objectives else []),
                 str(len(row.measured)),
@@ -185,9 +185,8 @@ class RealityGap:
         outline = self.session.outline
         lines += [
             f"  {self.verdict()}",
-            "  p value: of the two-sided Mann-Whitney test of the policies' returns against this control's, by the "
-            "normal approximation, which is too small where episodes are few; electrode pulses: per whole episode, one "
-            "for each electrode of each pulse",
+            "  p value: of the two-sided Mann-Whitney test of the policies' returns against this control's; electrode "
+            "pulses: per whole episode, one for each electrode of each pulse",
             f"  stimulation: {self.account}",
             f"  ticks: {outline.ticks}, bursts: {outline.bursts}, late pulses: {outline.late}"
             f" (the latest {1000 * outline.latest_s:.1f} ms); ended: {self.session.ending.message}",

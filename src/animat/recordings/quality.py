@@ -150,8 +150,9 @@ def _positions(recording: Recording) -> Iterator[Finding]:
     x_um, y_um = (axis[~np.isnan(axis)] for axis in (channels.x_um, channels.y_um))
     if len(x_um) < SEVERAL or len(x_um) != len(y_um):
         return
-    area_um2 = float(np.ptp(x_um) * np.ptp(y_um)) or max(np.ptp(x_um), np.ptp(y_um)) ** 2
-    apart_um = (area_um2 / len(x_um)) ** 0.5
+    width_um, height_um = float(np.ptp(x_um)), float(np.ptp(y_um))
+    # In a rectangle, or in a line.
+    apart_um = max((width_um * height_um / len(x_um)) ** 0.5, max(width_um, height_um) / len(x_um))
     if not PITCH_UM[0] < apart_um < PITCH_UM[1]:
         message = (
             f"{len(x_um):,} electrodes in {np.ptp(x_um):.3g} um x {np.ptp(y_um):.3g} um would be {apart_um:.2g} um "

@@ -43,7 +43,7 @@ LATE_SHARE, LATE_SPIKES = 0.1, 20
 SILENT_SHARES, SILENT_S, SILENT_SPIKES = (0.01, 0.5), 1.0, 1000
 """Likewise for silences, from the first spike on; a culture that is silent most of the time fires in bursts."""
 LONGEST_BURST_S = 10.0
-"""If it is not silent for longer than this between long silences, these are not between bursts."""
+"""What lasts longer than this, before a silence to the end that is longer still, is not a burst."""
 SILENCES = 5
 """Most silences that are reported together."""
 
@@ -258,7 +258,8 @@ def silences(recording: Recording) -> Iterator[Finding]:
     n = int(np.max(np.flatnonzero(stands_out), initial=-1)) + 1
     total_s = float(of_longest_s[:n].sum())
     active_s = float(length_s.sum()) - total_s
-    if total_s == 0 or (total_s >= most_s and active_s < n * LONGEST_BURST_S):
+    is_at_end = n == 1 and longest[0] == len(length_s) - 1
+    if total_s == 0 or (total_s >= most_s and not (is_at_end and active_s >= LONGEST_BURST_S)):
         return
     ended = ", or did it end earlier than stated" if longest[:n].max() == len(length_s) - 1 else ""
     where = ", ".join(f"from {times_s[i]:.12g} to {times_s[i + 1]:.12g} s" for i in sorted(longest[:n].tolist()))

@@ -288,7 +288,7 @@ def _inverted(below: float, above: float) -> Iterator[Finding]:
     if above > ENOUGH_BEYOND and above > TIMES_ABOVE * below:
         message = (
             "peaks above the noise are higher than those below it are deep, but the deep phase of a spike outside a "
-            "cell is negative: if the traces are inverted, multiply them by -1"
+            "cell is negative: multiply the traces by -1 if they are inverted, or, for artefacts, state the stimuli"
         )
         yield Finding("inverted", "warning", message, above / max(below, 1))
 
