@@ -280,3 +280,20 @@ def test_a_budget_counts_all_of_a_block_that_had_begun(
     assert len(pulsed()) == sum(delivered[: fails_at - 1])
     # No less than what came: the stretch that failed may have been delivered, too.
     assert account.pulses == len(block.stimuli) >= sum(delivered[:fails_at])
+
+
+def test_record_says_where_a_killed_run_s_recording_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    culture, *_ = on_cl1(monkeypatch)
+    with culture:
+        recording = culture.record(Protocol(**vars(MIXED) | {"pulse": CL1_PULSE, "trials": 20}), 1)
+    PartialRecording(tmp_path)(lambda: recording)
+    install_cl(monkeypatch)
+    protocol = tmp_path.with_suffix(".json")
+    protocol.write_text('{"trials": 10, "frequencies_hz": [10, 40]}')
+    record = ["record", "--culture", "cl1", "--protocol", str(protocol), "--sessions", "1", "--out", str(tmp_path)]
+    assert main(record) == 0
+    kept = tmp_path / "interrupted" / "recording_0000_min.nwb"
+    assert f"what a run that was killed had recorded is in {kept}" in capsys.readouterr().err
+    assert main(record) == 0 and "killed" not in capsys.readouterr().err

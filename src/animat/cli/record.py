@@ -58,6 +58,7 @@ class Record(FolderCommand):
     def run(self) -> dict[str, Any]:
         from animat.cultures.kinds import culture_of
         from animat.cultures.series import record_series
+        from animat.cultures.under_way import INTERRUPTED
         from animat.progress import Bar
         from animat.recordings.reading import read_recording, read_recordings
 
@@ -84,7 +85,7 @@ class Record(FolderCommand):
                 file=sys.stderr,
             )
         _expect_no_others(self.out)
-        before = set(self.out.glob("*"))
+        before, cut_short = set(self.out.glob("*")), set((self.out / INTERRUPTED).glob("*"))
         with Bar("recording") as progress:
             recordings = read_recordings(self.recordings) if self.recordings else []
             sessions = (15 if self.paper else 2) if self.sessions is None else self.sessions
@@ -113,6 +114,8 @@ class Record(FolderCommand):
                 at = f"{counted(len(missed), 'recording')} not made, as the next was due: at {some_of(missed)}"
                 print(f"missed: {at}; for others choose another --out", file=sys.stderr)
         files = series.files
+        for file in sorted(set((self.out / INTERRUPTED).glob("*")) - cut_short):
+            print(f"what a run that was killed had recorded is in {file}", file=sys.stderr)
         for file in files if is_device else ():
             if file not in before:
                 for finding in read_recording(file).findings:
