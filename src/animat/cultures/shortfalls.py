@@ -11,8 +11,8 @@ from animat.cultures.observed import Observed
 from animat.recordings.findings import Finding
 from animat.stimulation.schedule import Block
 
-LATE_S = 0.001
-"""Stimuli that come later than planned by more than this are counted."""
+LATE_S, LATE_PART = 0.001, 0.05
+"""Stimuli that come later than planned by more than this, and than this part of their interval, are counted."""
 LATE_SHARE, LOST_SHARE = 0.1, 0.01
 """Shares of the stimuli, and of the frames or spikes, above which there is a warning."""
 
@@ -44,12 +44,13 @@ def shortfalls(
         yield Finding("left-out", "warning" if share > LOST_SHARE else "note", message, share)
     delays_s = [observed.stimulus_time_s - block.stimuli.time_s for block, observed in parts]
     later_s = np.concatenate([np.diff(delay_s, prepend=0.0) for delay_s in delays_s])
-    late_s = later_s[later_s > LATE_S]
+    planned_s = np.concatenate([np.diff(block.stimuli.time_s, prepend=0.0) for block, _ in parts])
+    late_s = later_s[later_s > np.maximum(LATE_S, LATE_PART * planned_s)]
     if len(late_s):
         share = len(late_s) / len(later_s)
         message = (
-            f"{len(late_s):,} of {len(later_s):,} stimuli ({100 * share:.0f} %) came more than {1000 * LATE_S:g} ms "
-            f"later after the one before than planned, by {1000 * np.median(late_s):.3g} ms (median, at most "
+            f"{len(late_s):,} of {len(later_s):,} stimuli ({100 * share:.0f} %) came later after the one before than "
+            f"planned, by more than {1000 * LATE_S:g} ms and {100 * LATE_PART:g} % of the interval: by {1000 * np.median(late_s):.3g} ms (median, at most "
             f"{1000 * late_s.max():.3g}): their frequency is lower than stated"
         )
         remedy = "; present lower frequencies, and run nothing else on the machine" if share > LATE_SHARE else ""
