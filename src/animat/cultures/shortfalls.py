@@ -48,10 +48,11 @@ def shortfalls(
     late_s = later_s[later_s > np.maximum(LATE_S, LATE_PART * planned_s)]
     if len(late_s):
         share = len(late_s) / len(later_s)
+        by = f"{1000 * np.median(late_s):.3g} ms (median, at most {1000 * late_s.max():.3g})"
         message = (
             f"{len(late_s):,} of {len(later_s):,} stimuli ({100 * share:.0f} %) came later after the one before than "
-            f"planned, by more than {1000 * LATE_S:g} ms and {100 * LATE_PART:g} % of the interval: by {1000 * np.median(late_s):.3g} ms (median, at most "
-            f"{1000 * late_s.max():.3g}): their frequency is lower than stated"
+            f"planned, by more than {1000 * LATE_S:g} ms and {100 * LATE_PART:g} % of the interval: by {by}, so their "
+            "frequency is lower than stated"
         )
         remedy = "; present lower frequencies, and run nothing else on the machine" if share > LATE_SHARE else ""
         yield Finding("late-stimuli", "warning" if remedy else "note", message + remedy, share)
