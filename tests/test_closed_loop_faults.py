@@ -586,6 +586,17 @@ def test_a_robot_that_hangs_leaves_the_response_it_did_not_move_by(
     assert session.to_dict()["unanswered_pulses"] == 0
 
 
+def test_a_controller_that_exits_is_named(tmp_path: Path) -> None:
+    class Exits:
+        def act(self, observation: Any, rng: np.random.Generator) -> Any:
+            raise SystemExit(3)
+
+    with FakeCulture() as culture:
+        session = run_session(culture, loop_of(robot=LONG), [Agent("it", "", Exits())], tmp_path, episodes=1)
+        assert (session.ending.by, session.ending.message) == ("controller", "it raised SystemExit: 3")
+        assert_safe(session, culture, 0)
+
+
 @pytest.mark.parametrize(
     ("action", "words"),
     [(None, "raised TypeError"), (1.0, "raised TypeError"), (5, "chose 5"), (-1, "chose -1")],

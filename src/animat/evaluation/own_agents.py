@@ -71,7 +71,8 @@ class Called(Actor):
     def expect_no_failure(self) -> None:
         if (failure := self._failure) is not None:
             self._failure = None
-            raise InvalidArgument(f"agents: {self.name}: {type(failure).__name__}: {failure}") from failure
+            what = str(failure) if isinstance(failure, InvalidArgument) else first_line(failure)
+            raise InvalidArgument(f"agents: {self.name}: {what}") from failure
 
 
 def sees_neurons(controller: Controller) -> bool:
