@@ -97,7 +97,9 @@ def test_what_was_recorded_before_an_error_is_kept(
     device: Callable, error: BaseException, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     culture, _, pulsed, rate_hz = device(monkeypatch)
-    protocol = Protocol(**vars(MIXED) | {"pulse": CL1_PULSE if rate_hz == 25_000 else BALANCED_PULSE})
+    protocol = Protocol(**vars(MIXED) | {"pulse": CL1_PULSE if rate_hz == 25_000 else BALANCED_PULSE, "trials": 40})
+    # A tenth of the time, and as many stretches.
+    monkeypatch.setattr(type(culture), "stretch_s", 6.0)
     deliver = type(culture)._deliver
     calls: list[int] = []
 
@@ -112,9 +114,9 @@ def test_what_was_recorded_before_an_error_is_kept(
         record_series(lambda: culture, protocol, tmp_path, sessions=2, interval_min=5.0)
     (file,) = (tmp_path / "interrupted").iterdir()
     kept = read_recording(file)
-    assert any("2.0 min with 1,5" in note and str(file) in note for note in raised.value.__notes__)
-    assert len(kept.stimuli) == len(pulsed()) and 120 <= kept.duration_s < 121
-    assert json.loads(kept.protocol.to_json())["trials"] == 400  # type: ignore[union-attr]
+    assert any("0.2 min with 1" in note and str(file) in note for note in raised.value.__notes__)
+    assert len(kept.stimuli) == len(pulsed()) and 12 <= kept.duration_s < 13
+    assert json.loads(kept.protocol.to_json())["trials"] == 40  # type: ignore[union-attr]
     # On another day the clock begins at 0 again: that one has another name.
     before, calls[:] = file.read_bytes(), []
     culture = device(monkeypatch)[0]
@@ -125,7 +127,7 @@ def test_what_was_recorded_before_an_error_is_kept(
     monkeypatch.setattr(type(culture), "_deliver", deliver)
     culture = device(monkeypatch)[0]
     series = record_series(lambda: culture, protocol, tmp_path, sessions=1, interval_min=5.0)
-    assert [len(recording.stimuli) for recording in read_recordings([tmp_path])] == [2000]
+    assert [len(recording.stimuli) for recording in read_recordings([tmp_path])] == [200]
     assert len(series.files) == 1 and not list(tmp_path.glob(".*"))
 
 
@@ -262,7 +264,8 @@ def test_a_budget_counts_all_of_a_block_that_had_begun(
     device: Callable, fails_at: int, is_admitted: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     culture, _, pulsed, rate_hz = device(monkeypatch)
-    protocol = Protocol(**vars(MIXED) | {"pulse": CL1_PULSE if rate_hz == 25_000 else BALANCED_PULSE})
+    protocol = Protocol(**vars(MIXED) | {"pulse": CL1_PULSE if rate_hz == 25_000 else BALANCED_PULSE, "trials": 40})
+    monkeypatch.setattr(type(culture), "stretch_s", 6.0)
     account, calls, deliver = Account(), list[int](), type(culture)._deliver
 
     def fail(self: Culture, admitted: object, duration_s: float) -> object:
@@ -276,7 +279,7 @@ def test_a_budget_counts_all_of_a_block_that_had_begun(
         monkeypatch.setattr(type(culture), "_deliver", fail)
         with pytest.raises((DeviceFailed, KeyboardInterrupt)):
             record_within(account, culture, protocol, 1)
-    delivered = [len(stretch.stimuli) for stretch in block.stretches(60.0, 0.1)]
+    delivered = [len(stretch.stimuli) for stretch in block.stretches(6.0, 0.1)]
     assert len(pulsed()) == sum(delivered[: fails_at - 1])
     # No less than what came: the stretch that failed may have been delivered, too.
     assert account.pulses == len(block.stimuli) >= sum(delivered[:fails_at])
