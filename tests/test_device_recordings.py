@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,6 +15,8 @@ from animat.cli import main
 from animat.cultures.base import Culture
 from animat.cultures.budget import Account, record_within
 from animat.cultures.devices.cl1 import CL1_PULSE, CL1Culture
+from animat.cultures.observed import Observed
+from animat.cultures.safety import Admitted
 from animat.cultures.series import record_series
 from animat.cultures.under_way import UNDER_WAY, PartialRecording
 from animat.errors import DeviceFailed, InvalidFile
@@ -47,6 +51,19 @@ def on_maxone(patch: pytest.MonkeyPatch) -> tuple[Culture, Callable[[float], Non
         rig.now += round(20_000 * seconds)
 
     return culture_on(rig), run_on, lambda: np.array(sorted({pulse.frame for pulse in rig.delivered})), 20_000
+
+
+def fail_at(n: int, error: BaseException, kind: type[Culture], patch: pytest.MonkeyPatch) -> Any:
+    """Let the n-th request to a kind of culture fail; returns what delivered until then."""
+    deliver, requests = kind._deliver, itertools.count(1)
+
+    def deliver_or_fail(self: Culture, admitted: Admitted, duration_s: float) -> Observed:
+        if next(requests) == n:
+            raise error
+        return deliver(self, admitted, duration_s)
+
+    patch.setattr(kind, "_deliver", deliver_or_fail)
+    return deliver
 
 
 @pytest.mark.parametrize("device", [on_cl1, on_maxone])
@@ -100,16 +117,7 @@ def test_what_was_recorded_before_an_error_is_kept(
     protocol = Protocol(**vars(MIXED) | {"pulse": CL1_PULSE if rate_hz == 25_000 else BALANCED_PULSE, "trials": 40})
     # A tenth of the time, and as many stretches.
     monkeypatch.setattr(type(culture), "stretch_s", 6.0)
-    deliver = type(culture)._deliver
-    calls: list[int] = []
-
-    def fail_third(self: Culture, admitted: object, duration_s: float) -> object:
-        calls.append(1)
-        if len(calls) == 3:
-            raise error
-        return deliver(self, admitted, duration_s)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(type(culture), "_deliver", fail_third)
+    deliver = fail_at(3, error, type(culture), monkeypatch)
     with pytest.raises((KeyboardInterrupt, DeviceFailed)) as raised:
         record_series(lambda: culture, protocol, tmp_path, sessions=2, interval_min=5.0)
     (file,) = (tmp_path / "interrupted").iterdir()
@@ -118,7 +126,9 @@ def test_what_was_recorded_before_an_error_is_kept(
     assert len(kept.stimuli) == len(pulsed()) and 12 <= kept.duration_s < 13
     assert json.loads(kept.protocol.to_json())["trials"] == 40  # type: ignore[union-attr]
     # On another day the clock begins at 0 again: that one has another name.
-    before, calls[:] = file.read_bytes(), []
+    before = file.read_bytes()
+    monkeypatch.setattr(type(culture), "_deliver", deliver)
+    fail_at(3, error, type(culture), monkeypatch)
     culture = device(monkeypatch)[0]
     with pytest.raises((KeyboardInterrupt, DeviceFailed)):
         record_series(lambda: culture, protocol, tmp_path, sessions=2, interval_min=5.0)
@@ -266,17 +276,12 @@ def test_a_budget_counts_all_of_a_block_that_had_begun(
     culture, _, pulsed, rate_hz = device(monkeypatch)
     protocol = Protocol(**vars(MIXED) | {"pulse": CL1_PULSE if rate_hz == 25_000 else BALANCED_PULSE, "trials": 40})
     monkeypatch.setattr(type(culture), "stretch_s", 6.0)
-    account, calls, deliver = Account(), list[int](), type(culture)._deliver
-
-    def fail(self: Culture, admitted: object, duration_s: float) -> object:
-        calls.append(1)
-        if len(calls) == fails_at:
-            raise RuntimeError("a broken cable") if is_admitted else KeyboardInterrupt
-        return deliver(self, admitted, duration_s)  # type: ignore[arg-type]
-
+    account = Account()
+    fail_at(
+        fails_at, RuntimeError("a broken cable") if is_admitted else KeyboardInterrupt(), type(culture), monkeypatch
+    )
     with culture:
         (block,) = culture.schedule(protocol, 1).blocks
-        monkeypatch.setattr(type(culture), "_deliver", fail)
         with pytest.raises((DeviceFailed, KeyboardInterrupt)):
             record_within(account, culture, protocol, 1)
     delivered = [len(stretch.stimuli) for stretch in block.stretches(6.0, 0.1)]

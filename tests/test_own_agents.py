@@ -44,6 +44,16 @@ class Falling(Actor):
 
 @jax.tree_util.register_static
 @dataclass(frozen=True)
+class OfFour(Actor):
+    """The same, for four observed quantities."""
+
+    def act(self, environment: Any, observation: Any, uniforms: Any) -> Any:
+        _, _, angle, _ = jnp.moveaxis(observation * environment.scales, -1, 0)
+        return jnp.where(angle > 0, 4, 0)
+
+
+@jax.tree_util.register_static
+@dataclass(frozen=True)
 class Always(Actor):
     index: float
 
@@ -216,5 +226,9 @@ def test_an_agent_sees_the_neurons_if_the_policies_do() -> None:
     )
     found = evaluate({"p0": seeing}, timeline, episodes=20, controls=[], agents={"it": Greedy(seeing), "rule": Plain()})
     assert found.rows[1].episodes.returns.tolist() == found.rows[0].episodes.returns.tolist()
+    # In JAX it sees the robot, as in a closed loop.
+    agents = {"plain": Plain(), "in JAX": Falling(), "of four": OfFour()}
+    plain, *in_jax = evaluate({"p0": seeing}, timeline, episodes=20, controls=[], agents=agents).rows[1:]
+    assert all(row.episodes.returns.tolist() == plain.episodes.returns.tolist() for row in in_jax)
     with pytest.raises(InvalidArgument, match="expected one that sees the robot only, got one with neural_observation"):
         evaluate({"p0": policy_of(timeline, robot)}, timeline, agents={"it": Greedy(seeing)})

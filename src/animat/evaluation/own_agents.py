@@ -5,6 +5,7 @@ from __future__ import annotations
 import operator
 import threading
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, Protocol, final
 
 import jax
@@ -19,6 +20,7 @@ from animat.evaluation.rollouts import Actor, Seen, Uniforms, trace
 from animat.registry import imported
 from animat.responses.condition import Condition
 from animat.robots.host import HostRobot
+from animat.wrappers import unwrapped
 
 _GRID = 2**24
 """Uniforms of single precision are multiples of 1 / 2^24."""
@@ -75,6 +77,19 @@ class Called(Actor):
             raise InvalidArgument(f"agents: {self.name}: {what}") from failure
 
 
+@final
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class RobotOnly(Actor):
+    """An actor that sees the robot only, as it does in a closed loop, where the policies also see the neurons."""
+
+    actor: Actor
+
+    def act(self, environment: Environment[Any], observation: Seen, uniforms: Uniforms) -> Array:
+        inside = unwrapped(environment)
+        return self.actor.act(inside, observation[:, : len(inside.observation_spec)], uniforms)
+
+
 def sees_neurons(controller: Controller) -> bool:
     """Whether a controller, or the policy that it makes greedy, also observes the neurons' history state."""
     return bool(getattr(getattr(controller, "policy", controller), "neural_observation", False))
@@ -96,12 +111,15 @@ def controls_of_own(
             raise InvalidArgument(f"agents: expected names other than {some_of(sorted(taken))}, got {name}")
         if not callable(getattr(agent, "act", None)):
             raise InvalidArgument(f"agents: {name}: expected an Actor, or a method `act`, got {shown(agent)}")
+        has_neurons = len(environment.observation_spec) > len(environment.robot.observation_spec)
         if isinstance(agent, Actor):
-            _try(name, agent, environment, simulator)
-        elif sees_neurons(agent) and len(environment.observation_spec) == len(environment.robot.observation_spec):
+            actor = RobotOnly(agent) if has_neurons else agent
+            _try(name, actor, environment, simulator)
+        elif sees_neurons(agent) and not has_neurons:
             got = "one with neural_observation, which these policies do not have"
             raise InvalidArgument(f"agents: {name}: expected one that sees the robot only, got {got}")
-        actor = agent if isinstance(agent, Actor) else Called(name, agent)
+        else:
+            actor = Called(name, agent)
         controls.append(Control(name, "your own agent", actor))
     return controls
 

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import chain
 from typing import Any, Self
 
@@ -32,6 +31,7 @@ from animat.recordings.findings import Finding
 from animat.robots.base import Robot, lacking
 from animat.robots.host import HostRobot
 from animat.tables import briefly
+from animat.training.folder import versions_of
 from animat.training.policy import Policy, first_of_alike
 from animat.wrappers import NeuralObservation, TrialCosts, unwrapped
 
@@ -56,6 +56,7 @@ class Evaluation:
         net_optimum: the optimal return of any controller less the cost of pulses, if they have a cost.
         seed: of all random draws.
         greedy: whether policies took their most probable actions, or drew them as in training.
+        versions: of what may round or draw differently.
     """
 
     __repr__ = briefly
@@ -75,6 +76,7 @@ class Evaluation:
     net_optimum: Optimum | None = None
     seed: int = 1
     greedy: bool = True
+    versions: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def context_score(self) -> Interval | None:
@@ -120,7 +122,7 @@ class Evaluation:
             "percentiles_fixed_from_min": self.fixed_from_min,
             "seed": self.seed,
             "actions": self._actions,
-            "versions": {name: importlib.metadata.version(name) for name in ("animat", "jax", "numpy")},
+            "versions": self.versions,
             "policies": dict(zip(self.names, self.rows[0].mean_returns.tolist(), strict=True)),
             "rows": [
                 {**row.to_dict(), "normalised_score": self.score(row), "returns": row.episodes.returns.tolist()}
@@ -318,6 +320,7 @@ def evaluate(
         net_optimum=net_optimum,
         seed=seed,
         greedy=greedy,
+        versions=versions_of(("animat", "jax", "jaxlib", "numpy"), [body]),
     )
 
 

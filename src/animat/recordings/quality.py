@@ -98,9 +98,9 @@ def _order(recording: Recording) -> Iterator[Finding]:
     """A finding on trials whose frequencies are not in the stated order; those of a protocol are."""
     frequency_hz = recording.stimuli.frequency_hz[recording.stimuli.is_last_of_presentation]
     frequency_hz = frequency_hz[~np.isnan(frequency_hz)]
-    shares = np.unique(frequency_hz, return_counts=True)[1] / max(1, len(frequency_hz))
     if recording.presentation is None or recording.protocol is not None or len(frequency_hz) < MANY_STIMULI:
         return
+    shares = np.unique(frequency_hz, return_counts=True)[1] / len(frequency_hz)
     # In random order, the share of trials with another frequency than the one before.
     mixed, order = 1 - float(np.sum(shares**2)), recording.presentation.order
     changes = float(np.mean(~is_same(frequency_hz[1:], frequency_hz[:-1])))
@@ -155,7 +155,7 @@ def _positions(recording: Recording) -> Iterator[Finding]:
     apart_um = max((width_um * height_um / len(x_um)) ** 0.5, max(width_um, height_um) / len(x_um))
     if not PITCH_UM[0] < apart_um < PITCH_UM[1]:
         message = (
-            f"{len(x_um):,} electrodes in {np.ptp(x_um):.3g} um x {np.ptp(y_um):.3g} um would be {apart_um:.2g} um "
+            f"{len(x_um):,} electrodes in {width_um:.3g} um x {height_um:.3g} um would be {apart_um:.2g} um "
             "apart: provide their positions in micrometres"
         )
         yield Finding("positions-not-in-um", "warning", message, apart_um)
