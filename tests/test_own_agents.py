@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import re
+import signal
+import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -12,7 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from animat.closed_loop.agents import Greedy
+from animat.closed_loop.agents import Agent, Greedy
+from animat.closed_loop.running import run_session
 from animat.errors import InvalidArgument
 from animat.evaluation.own_agents import agents_at
 from animat.evaluation.rollouts import Actor
@@ -25,6 +29,8 @@ from animat.responses.extraction import extract_responses
 from animat.responses.responses import Responses
 from animat.robots import Cartpole
 from fake_culture import FakeCulture
+from test_bodies_of_others import named
+from test_closed_loop import loop_of
 from test_evaluation import policy_of
 from test_optimal_returns import answers
 from test_reality_gap import PROTOCOL
@@ -59,6 +65,12 @@ class Always(Actor):
 
     def act(self, environment: Any, observation: Any, uniforms: Any) -> Any:
         return jnp.full(len(observation), self.index)
+
+
+@dataclass(frozen=True)
+class Unregistered(Actor):
+    def act(self, environment: Any, observation: Any, uniforms: Any) -> Any:
+        return jnp.zeros(len(observation), int)
 
 
 @jax.tree_util.register_static
@@ -127,6 +139,13 @@ def test_an_agent_outside_jax_is_evaluated_as_one_in_jax_and_a_policy_as_itself(
             Wrong(ZeroDivisionError("no")),
             r"agents: mine: ZeroDivisionError: no \(.*test_own_agents.py, line \d+\)",
         ),
+        ("mine", Wrong(KeyboardInterrupt("mine")), "agents: mine: KeyboardInterrupt: mine"),
+        (
+            "mine",
+            Unregistered(),
+            r"agents: mine: expected a JAX pytree \(jax.tree_util.register_static or .*, got Unreg",
+        ),
+        ("p0", Plain(), "agents: expected names other than .*, got p0"),
         ("mine", 3, "agents: mine: expected an Actor, or a method `act`, got 3"),
         ("random", Plain(), "agents: expected names other than .*, got random"),
         ("policies", Plain(), "agents: expected names other than .*, got policies"),
@@ -232,3 +251,87 @@ def test_an_agent_sees_the_neurons_if_the_policies_do() -> None:
     assert all(row.episodes.returns.tolist() == plain.episodes.returns.tolist() for row in in_jax)
     with pytest.raises(InvalidArgument, match="expected one that sees the robot only, got one with neural_observation"):
         evaluate({"p0": policy_of(timeline, robot)}, timeline, agents={"it": Greedy(seeing)})
+
+
+class Counting:
+    """Keeps to one condition in the first half of an episode, and to another in the second."""
+
+    def __init__(self) -> None:
+        self.seen = 0
+
+    def act(self, observation: np.ndarray, rng: np.random.Generator) -> int:
+        self.seen += 1
+        return 0 if self.seen <= 3 else 4
+
+
+class Remembering:
+    def begin(self) -> Counting:
+        return Counting()
+
+    def act(self, observation: np.ndarray, rng: np.random.Generator) -> int:
+        raise AssertionError("it was not begun")
+
+
+def test_an_agent_that_remembers_begins_anew_in_each_episode() -> None:
+    timeline = five_conditions()
+    robot = Cartpole(episode_limit=7)
+    policy = policy_of(timeline, robot)
+    found = evaluate({"p0": policy}, timeline, episodes=9, controls=[], agents={"mine": Remembering()}).rows[1]
+    lengths = found.episodes.lengths.ravel()
+    presented = found.episodes.presented[0]
+    assert presented[0] == np.minimum(lengths, 3).sum() and presented[4] == np.maximum(lengths - 3, 0).sum() > 0
+    again = evaluate({"p0": policy}, timeline, episodes=9, controls=[], agents={"mine": Remembering()}).rows[1]
+    assert again.episodes.returns.tolist() == found.episodes.returns.tolist()
+    with pytest.raises(InvalidArgument, match=r"agents: mine: act: expected one condition for .*, got 0, then 4: draw"):
+        evaluate({"p0": policy}, timeline, episodes=9, controls=[], agents={"mine": Counting()})
+
+
+def test_in_a_loop_it_begins_anew_too(tmp_path: Path) -> None:
+    agent = Agent("mine", "your own agent", Remembering())
+    with FakeCulture() as culture:
+        session = run_session(culture, loop_of(), [agent], tmp_path / "a", episodes=2)
+    chosen = [(tick.episode, tick.iteration, tick.chosen) for tick in session.ticks if tick.iteration >= 0]
+    assert {episode for episode, _, _ in chosen} == {0, 1}
+    assert all(condition == (0 if iteration < 3 else 4) for _, iteration, condition in chosen)
+
+
+def test_ctrl_c_is_not_held_until_the_last_episode(in_the_foreground: None) -> None:
+    class Slow(Plain):
+        asked = 0
+
+        def act(self, observation: np.ndarray, rng: np.random.Generator) -> Any:
+            Slow.asked += 1
+            if Slow.asked == 20:
+                os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(0.01)
+            return 0 if Slow.asked % 2 else 4
+
+    timeline = five_conditions()
+    policy = policy_of(timeline)
+    with pytest.raises(KeyboardInterrupt):
+        evaluate({"p0": policy}, timeline, episodes=100, controls=[], agents={"slow": Slow()})
+    # Of some thousand.
+    assert Slow.asked < 200
+
+
+@pytest.mark.parametrize(
+    ("agent", "message"),
+    [
+        (Always(-1), "agents: mine: act: expected the index of .* from 0 to 4, got -1"),
+        (Always(9), "agents: mine: act: expected the index of .* from 0 to 4, got 9"),
+        (Always(1.0), "whole number from 0 to 4, got 1.0|to act in JAX, got TypeCheckError"),
+        (Misshaped(), "agents: mine: expected it to act in JAX, got"),
+    ],
+)
+def test_on_a_robot_outside_jax_an_agent_in_jax_is_tried_too(agent: Actor, message: str) -> None:
+    timeline = five_conditions()
+    robot = named("Slider")
+    policy = replace(
+        policy_of(timeline),
+        robot=robot,
+        weights=(np.ones((2, 16), np.float32), *policy_of(timeline).weights[1:]),
+        scales=np.ones(2, np.float32),
+    )
+    with pytest.raises(InvalidArgument, match=message):
+        evaluate({"p0": policy}, timeline, episodes=2, controls=[], agents={"mine": agent})
+    evaluate({"p0": policy}, timeline, episodes=2, controls=[], agents={"mine": Always(0)})

@@ -203,6 +203,10 @@ def _live_page(command: Command) -> contextlib.AbstractContextManager[None]:
 
 
 _SEE = "; see animat --help"
+_DESCRIPTION = (
+    "Drive a robot with a living neuronal culture.\n\n"
+    "animat COMMAND --help describes a command; animat --version prints the version."
+)
 
 
 def _parse(arguments: list[str]) -> Command:
@@ -224,12 +228,12 @@ def _parse(arguments: list[str]) -> Command:
     command: Command
     try:
         with contextlib.redirect_stderr(output):
+            # All commands only where none is named: to read all takes twice as long.
             command, unknown = tyro.cli(
-                _SUBCOMMANDS,
-                prog="animat",
-                description="Drive a robot with a living neuronal culture.\n\n"
-                "animat COMMAND --help describes a command; animat --version prints the version.",
-                args=arguments,
+                COMMANDS.get(name, _SUBCOMMANDS),
+                prog=f"animat {name}" if fields else "animat",
+                description=None if fields else _DESCRIPTION,
+                args=arguments[1:] if fields else arguments,
                 config=(FlagCreatePairsOff, OmitArgPrefixes, DisallowNone),
                 registry=_options(),
                 return_unknown_args=True,

@@ -27,7 +27,7 @@ from animat.cultures.base import Culture
 from animat.cultures.budget import Account
 from animat.cultures.failures import describe_error
 from animat.errors import AnimatError, BudgetSpent
-from animat.evaluation.own_agents import Controller
+from animat.evaluation.own_agents import Controller, begun
 from animat.neurons.history_tracker import HistoryState
 from animat.responses.extraction import SILENCE_S
 from animat.robots.starts import robot_generator
@@ -116,11 +116,11 @@ class Driver:
         loop = self.loop
         turn = self._n_begun[agent.name]
         self._n_begun[agent.name] += 1
-        controller = agent.acting(turn)
         observation = self._start(episode, turn)
         self._last_command = 0.0 if (n := loop.robot.n_commands) == 1 else (0.0,) * n
         for rounds in loop.rounds_before(episode, is_silent=agent.delivery == "silent"):
             self._warm_up(agent, episode, rounds)
+        controller = self._answer_of(agent.name, "controller", lambda: begun(agent.acting(turn)))
         remembering = loop.remembering if agent.sees_neurons(turn) else None
         source, conditions = list[int](), list[int]()
         if agent.delivery == "yoked":

@@ -67,6 +67,7 @@ def roll_out_on_host(
             folded = jax.vmap(jax.random.fold_in, (0, None))(keys[some], first)
             of_episodes = (each[some, first : first + side_by_side] for each in counts[:3])
             wave = Counts(*of_episodes, *(each[some] for each in counts[3:]))
+            actors.begin()
             _count_wave(environment, simulator, acting, folded, seeds, wave)
     return counts
 

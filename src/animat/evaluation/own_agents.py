@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import operator
-import threading
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any, Protocol, final
+from typing import Any, Protocol, TypeVar, final
 
 import jax
 import jax.numpy as jnp
@@ -22,12 +22,19 @@ from animat.responses.condition import Condition
 from animat.robots.host import HostRobot
 from animat.wrappers import unwrapped
 
+T = TypeVar("T")
+
 _GRID = 2**24
 """Uniforms of single precision are multiples of 1 / 2^24."""
+_ASKED_AGAIN = 20
+"""So many decisions of a roll-out are asked for again at its end."""
 
 
 class Controller(Protocol):
-    """What chooses conditions: a `Policy`, or anything else that acts like one."""
+    """What chooses conditions: a `Policy`, or anything else that acts like one.
+
+    One that remembers earlier observations also has a method `begin`, which returns what acts in the next episode.
+    """
 
     def act(self, observation: Float[np.ndarray, " observations"], rng: np.random.Generator) -> Any:
         """The index of the condition to present, for the robot's observation in its own units."""
@@ -38,13 +45,15 @@ class Controller(Protocol):
 class Called(Actor):
     """A controller outside JAX as an actor: it is called for every observation of every episode.
 
-    What goes wrong in a call is kept, as JAX would report it in its own words; see `expect_no_failure`.
+    What goes wrong in a call is kept, as JAX would report it in its own words; see `expect_no_failure`. Only one
+    roll-out at a time can use it.
     """
 
     def __init__(self, name: str, controller: Controller) -> None:
         self.name, self.controller = name, controller
         self._failure: BaseException | None = None
-        self._lock = threading.Lock()
+        self._in_episodes: list[Controller] = []
+        self._answers: list[tuple[np.ndarray, float, int]] = []
 
     def act(self, environment: Environment[Any], observation: Seen, uniforms: Uniforms) -> Array:
         n, seen = environment.n_actions or 0, observation * environment.scales
@@ -52,29 +61,61 @@ class Called(Actor):
             seen = seen[:, : len(environment.robot.observation_spec)]
 
         def choose(observation: np.ndarray, uniforms: np.ndarray) -> np.ndarray:
-            # A prediction uses several threads, which the controller need not know.
-            with self._lock:
-                return np.array([self._choose(*each, n) for each in zip(observation, uniforms, strict=True)], np.int32)
+            asked = list(enumerate(zip(observation, uniforms, strict=True)))
+            return np.array([self._choose(episode, *each, n) for episode, each in asked], np.int32)
 
         chosen = jax.ShapeDtypeStruct(observation.shape[:1], jnp.int32)
         called: Array = jax.pure_callback(choose, chosen, seen, uniforms[:, 0], vmap_method="sequential")
         return called
 
-    def _choose(self, observation: np.ndarray, uniform: float, n_actions: int) -> int:
+    def _choose(self, episode: int, observation: np.ndarray, uniform: float, n_actions: int) -> int:
         if self._failure is not None:
             return 0
         try:
-            chosen = self.controller.act(np.array(observation), np.random.default_rng(int(uniform * _GRID)))
-            return _expect_condition(chosen, n_actions)
-        except (Exception, SystemExit) as error:
+            if episode == len(self._in_episodes):
+                self._in_episodes.append(begun(self.controller))
+            chosen = _expect_condition(_asked(self._in_episodes[episode], observation, uniform), n_actions)
+        except BaseException as error:
             self._failure = error
             return 0
+        if not episode and len(self._answers) < _ASKED_AGAIN:
+            self._answers.append((np.array(observation), uniform, chosen))
+        return chosen
+
+    def begin(self) -> None:
+        self._in_episodes, self._answers = [], []
+
+    def apart(self, run: Callable[[], T]) -> T:
+        # Ctrl-C reaches the main thread only, and not while it waits for JAX, which would be after the last episode.
+        with ThreadPoolExecutor(1) as thread:
+            try:
+                return thread.submit(run).result()
+            except BaseException as error:
+                # The controller is called no more, so the thread ends soon.
+                self._failure = error
+                raise
 
     def expect_no_failure(self) -> None:
+        if self._failure is None and not hasattr(self.controller, "begin"):
+            for observation, uniform, chosen in self._answers:
+                if (again := _asked(self.controller, observation, uniform)) != chosen:
+                    expected = "expected one condition for the same observation and random numbers"
+                    remedy = "draw only from rng, and give an agent that remembers a method begin (docs/agents.md)"
+                    raise InvalidArgument(f"agents: {self.name}: act: {expected}, got {chosen}, then {again}: {remedy}")
         if (failure := self._failure) is not None:
             self._failure = None
             what = str(failure) if isinstance(failure, InvalidArgument) else first_line(failure)
             raise InvalidArgument(f"agents: {self.name}: {what}") from failure
+
+
+def begun(controller: Controller) -> Controller:
+    """What acts in one episode: the controller itself, unless it remembers."""
+    begin = getattr(controller, "begin", None)
+    return begin() if callable(begin) else controller
+
+
+def _asked(controller: Controller, observation: np.ndarray, uniform: float) -> Any:
+    return controller.act(np.array(observation), np.random.default_rng(int(uniform * _GRID)))
 
 
 @final
@@ -126,18 +167,37 @@ def controls_of_own(
 
 def _try(name: str, actor: Actor, environment: Environment[Any], simulator: Neurons) -> None:
     """Raise InvalidArgument for an actor that raises, or whose actions, which JAX would not refuse, are none."""
-    if actor.n_actors != 1:
-        raise InvalidArgument(f"agents: {name}: expected one actor, got {actor.n_actors} side by side")
-    if isinstance(environment.robot, HostRobot):
-        return
     try:
-        actions = trace(environment, simulator, actor, episodes=8, seed=1).actions
+        n_actors = actor.n_actors
+    except TypeError:
+        expected = "expected a JAX pytree (jax.tree_util.register_static or register_dataclass)"
+        raise InvalidArgument(f"agents: {name}: {expected}, got {shown(actor)}") from None
+    if n_actors != 1:
+        got = f"{n_actors} side by side: give each of its arrays a first axis of length one"
+        raise InvalidArgument(f"agents: {name}: expected one actor, got {got}")
+    try:
+        if isinstance(environment.robot, HostRobot):
+            actions = _tried_apart(actor, environment)
+        else:
+            actions = trace(environment, simulator, actor, episodes=8, seed=1).actions
         found = np.unique(actions).tolist()
     except Exception as error:
         raise InvalidArgument(f"agents: {name}: expected it to act in JAX, got {first_line(error)}") from error
     for action in found:
         with within(f"agents: {name}"):
             _expect_condition(action, environment.n_actions or 0)
+
+
+def _tried_apart(actor: Actor, environment: Environment[Any]) -> np.ndarray:
+    """What an actor chooses for random observations, without a robot, which outside JAX may take seconds."""
+    observation, uniforms = jax.random.split(jax.random.key(1))
+    seen = 0.5 * jax.random.normal(observation, (1_000, len(environment.observation_spec)))
+    drawn = jax.random.uniform(uniforms, (len(seen), environment.n_drawn))
+    alone = jax.tree.map(lambda part: part[0], actor)
+    chosen = np.asarray(jax.jit(lambda: alone.act(environment, seen, drawn))())
+    if chosen.shape != (len(seen),):
+        raise ValueError(f"act: expected the shape (episodes,), got {chosen.shape} for {len(seen):,} episodes")
+    return chosen
 
 
 def _expect_condition(chosen: Any, n: int) -> int:
@@ -162,7 +222,8 @@ def agents_at(places: Sequence[str], conditions: Sequence[Condition]) -> dict[st
         name = place.partition(":")[2]
         if not name or name in agents:
             expected = "a module and what is in it, such as my_rule:Rule" if not name else "different names"
-            raise InvalidArgument(f"agents: expected {expected}, got {shown(place)}")
+            remedy = ": import one of them under another name" if name else ""
+            raise InvalidArgument(f"agents: expected {expected}, got {shown(place)}{remedy}")
         agent = imported("agents", place)
         if isinstance(agent, type):
             try:

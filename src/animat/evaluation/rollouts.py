@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple, final
+from typing import Any, NamedTuple, TypeVar, final
 
 import jax
 import jax.numpy as jnp
@@ -28,6 +28,7 @@ from animat.tables import briefly
 from animat.training.networks import Layer, Network, as_commands, draw_action, likeliest_action
 from animat.training.policy import Policy
 
+T = TypeVar("T")
 Seen = Float[Array, "episodes observations"]
 Uniforms = Float[Array, "episodes drawn"]
 
@@ -45,7 +46,15 @@ class Actor(abc.ABC):
         arrays = jax.tree.leaves(self)
         return len(arrays[0]) if arrays else 1
 
-    def expect_no_failure(self) -> None:  # noqa: B027 - only actors that call something outside JAX can fail
+    # Only actors that call something outside JAX can fail, remember, or take long.
+    def begin(self) -> None:  # noqa: B027
+        """Forget all episodes, as others begin."""
+
+    def apart(self, run: Callable[[], T]) -> T:
+        """Run episodes in JAX such that Ctrl-C ends them soon."""
+        return run()
+
+    def expect_no_failure(self) -> None:  # noqa: B027
         """Raise InvalidArgument if it failed to act since the last call."""
 
 
@@ -220,8 +229,9 @@ def roll_out(
             *roll_out_on_host(environment, episodes, simulator, actors, keys, seed, alike=alike, starts=starts)
         )
     of_episodes = None if starts is None else starts.of_episodes(episodes)
-    *counted, terminated, outcome = jax.device_get(
-        _roll_out(environment, episodes, simulator, actors, keys, of_episodes)
+    actors.begin()
+    *counted, terminated, outcome = actors.apart(
+        lambda: jax.device_get(_roll_out(environment, episodes, simulator, actors, keys, of_episodes))
     )
     kinds = (np.float64, np.int64, np.int64, np.float64)
     returns, lengths, presented, commanded = (x.astype(kind) for x, kind in zip(counted, kinds, strict=True))

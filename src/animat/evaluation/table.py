@@ -270,7 +270,9 @@ def evaluate(
         if unknown := sorted({*controls} - {*known, "heuristic", "coupling"}):
             raise InvalidArgument(f"controls: expected some of {', '.join(known)}, got {', '.join(unknown)}")
     acting = [trained, *(control for control in all_controls if controls is None or control.name in controls)]
-    acting += controls_of_own(agents or {}, *within, ["policies", "coupling", *(each.name for each in all_controls)])
+    acting += controls_of_own(
+        agents or {}, *within, ["policies", "coupling", *policies, *(each.name for each in all_controls)]
+    )
     wants_coupling = optimum_resolution is not None and (controls is None or "coupling" in controls)
     searches = wants_coupling and not isinstance(body, HostRobot)
     steps = len(acting) + searches

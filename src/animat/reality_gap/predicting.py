@@ -119,12 +119,13 @@ def predict(
         side_by_side = map if executor is None else executor.map
         # First one of each kind: two of a kind that start at the same time would both be compiled.
         progress.update(0, len(acting), "compiling")
-        kinds = {_program_of(control): number for number, control in enumerate(acting)}
+        in_jax = [number for number, control in enumerate(acting) if not isinstance(control.actor, Called)]
+        kinds = {_program_of(acting[number]): number for number in in_jax}
         list(side_by_side(run, kinds.values(), repeat(0)))
         for number, control in enumerate(acting):
             progress.update(number, len(acting), control.name)
             n = min(len(simulators), ROLL_OUTS + BOOTSTRAPS_ON_HOST) if is_slow(number) else len(simulators)
-            ran = list(side_by_side(run, repeat(number), range(n)))
+            ran = list((side_by_side if number in in_jax else map)(run, repeat(number), range(n)))
             returns = np.array([each.returns for each in ran])
             presented = np.array([each.presented for each in ran])
             total = np.array([each.commanded for each in ran]).reshape(*presented.shape, -1)
