@@ -27,6 +27,7 @@ from animat.evaluation.optimum import best_return, best_returns
 from animat.evaluation.rollouts import Constant, Uniform, heuristic_policy, networks_of, roll_out
 from animat.execution.training import train
 from animat.neurons.fidelity import fidelity
+from animat.neurons.history_tracker import HistoryState, HistoryTracker
 from animat.neurons.memory import NO_MEMORY, Memory, MemorySimulator, _slopes, fit_memory
 from animat.neurons.simulator import EmpiricalSimulator, fit_empirical
 from animat.neurons.timeline import Kind, fit_timeline, load_timeline, save_timeline
@@ -905,3 +906,56 @@ def test_training_through_a_memory_begins_each_episode_alike(tmp_path: Path) -> 
     for policy in trained.values():
         means = policy.learning_curve[:, 2]
         np.testing.assert_allclose(means[~np.isnan(means)], played.returns[0, 0], atol=5e-3)
+
+
+def slow(n: int, slow_conditions: tuple[int, ...], *, trend: float, carry: float = 0.0, seed: int = 1) -> Responses:
+    """Responses that rise over the recording, of three conditions; trials of some come after a silence each."""
+    rng = np.random.default_rng(seed)
+    condition = rng.integers(0, 3, n)
+    is_rested = np.isin(condition, slow_conditions)
+    x, before = np.zeros(n), 0.0
+    for i, c in enumerate(condition):
+        noise = rng.normal(0, 5)
+        x[i] = 50 + 4 * c + trend * i / n + noise + (0.0 if is_rested[i] else carry * before)
+        before = noise
+    every = Trials(condition, x, np.zeros(n, bool), is_rested)
+    columns = {"condition": condition, "rate_hz": x, "active_ratio": np.full(n, 0.1), "is_burst": every.is_burst}
+    return replace(responses_of(*[[1.0]] * 3), presented=every, place=np.arange(n), **columns)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_drift_of_responses_after_silence_is_no_memory(seed: int) -> None:
+    """All have the same history, so their order is that of time."""
+    assert fit_memory(slow(300, (0, 1, 2), trend=20.0, seed=seed)).memory == NO_MEMORY
+
+
+def test_trials_after_silence_are_answered_with_all_responses_to_such() -> None:
+    responses = slow(600, (0,), trend=20.0, carry=0.9)
+    simulator = fit_memory(responses, memory=Memory(0.0, 0.0, 0.5))
+    assert np.asarray(simulator.rests).tolist() == [True, False, False]
+    uniforms = (jnp.arange(4000) + 0.5) / 4000
+    answer = jax.vmap(simulator.answer, (None, 0, None))
+    recorded = np.sort(responses.rate_hz[responses.condition == 0])
+    for trace in (0.1, 0.9):
+        answers = np.sort(np.asarray(answer(jnp.int32(0), uniforms, after(trace)).rate_hz))
+        np.testing.assert_allclose(
+            np.quantile(answers, [0.1, 0.5, 0.9]), np.quantile(recorded, [0.1, 0.5, 0.9]), rtol=0.01
+        )
+        # The next trace is that of this response alone.
+        assert float(answer(jnp.int32(0), uniforms, after(trace)).history[0, 0]) < 0.05
+    # The others depend on it.
+    low, high = (float(answer(jnp.int32(1), uniforms, after(trace)).rate_hz.mean()) for trace in (0.1, 0.9))
+    assert high > low + 2
+
+
+def test_without_memory_policies_see_in_training_what_they_see_in_a_loop() -> None:
+    rng = np.random.default_rng(2)
+    responses = responses_of(rng.normal(50, 5, 200), rng.normal(60, 5, 200))
+    simulator = fit_memory(responses)
+    assert simulator.memory == NO_MEMORY
+    history = simulator.answer(jnp.int32(1), jnp.float32(0.9), after(0.5)).history
+    assert (
+        tuple(history.tolist())
+        == HistoryTracker.of(responses, simulator).observed(HistoryState(0.2, 0.7))
+        == (0.5, 0.5)
+    )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from datetime import datetime
 from typing import Any
 
 import numpy as np
@@ -199,3 +200,8 @@ def test_problems_in_the_data_are_reported() -> None:
     partly = recording(spike_channels=[0, 0, 0], stimuli=stimuli(electrodes=electrodes))
     found = {f.name: f.value for f in recording_findings(partly)}
     assert found == {"silent-channels": 2.0, "stimulus-electrodes-unknown": 2.0, "presentation-unknown": None}
+
+
+def test_the_date_of_a_recording_has_a_time_zone() -> None:
+    with pytest.raises(UnusableData, match="recorded_at: expected a date with a time zone, got 2026-11-29 12:00:00"):
+        recording(recorded_at=datetime(2026, 11, 29, 12))

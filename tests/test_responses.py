@@ -20,7 +20,7 @@ from animat.responses.inspection import inspect_recording
 from animat.responses.psth import find_response, post_stimulus_histogram, spontaneous_rate
 from animat.responses.responses import Responses
 from animat.stimulation.protocol import Presentation
-from animat.stimulation.stimulus import Stimuli
+from animat.stimulation.stimulus import NOTHING, Stimuli
 from synthetic_recordings import synthetic_recording
 
 
@@ -377,3 +377,36 @@ def test_a_table_of_responses_has_a_row_for_each() -> None:
         kept = table[(table["condition"] == condition.label) & ~table["is_burst"]]
         np.testing.assert_array_equal(kept["rate_hz"], responses.rates_of(i))
     assert set(table["start_min"]) == {5.0} and "time_s" not in replace(responses, time_s=None).to_frame()
+
+
+def test_rests_are_no_responses_to_the_stimuli_that_share_their_frequency() -> None:
+    pattern, times = [0, NOTHING] * 40, 1.0 + 0.2 * np.arange(80)
+    spikes = [(t + 0.005, c) for t, p in zip(times.tolist(), pattern, strict=True) if p == 0 for c in (0, 1)]
+    source = recording(spikes, times, duration_s=20.0, pattern=pattern)
+    for by in ("frequency", "all", "interval:5"):
+        responses = extract_responses(source, by, burst_threshold=1.0)
+        assert len(responses) == 40 - (by == "interval:5")
+        assert np.all(responses.rate_hz > 0)
+        # They still are the history of the others.
+        assert len(responses.presentations[0].rate_hz) == 80
+        (left_out,) = (f.message for f in responses.findings if f.name == "no-condition")
+        assert "40 of which deliver nothing (--conditions electrode)" in left_out
+    alone = extract_responses(recording([], times, duration_s=20.0, pattern=[NOTHING] * 80), "all", burst_threshold=1.0)
+    assert len(alone) == 80
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_pulses_at_1_hz_never_come_after_a_silence(seed: int) -> None:
+    jitter_s = np.random.default_rng(seed).integers(-1, 2, 200) / 20_000
+    times = np.round(1.0 + np.arange(200) + jitter_s, 6)
+    source = recording([(t + 0.005, 0) for t in times.tolist()], times, duration_s=202.0, frequency_hz=np.ones(200))
+    presented = extract_responses(source, burst_threshold=1.0).presentations[0]
+    assert np.flatnonzero(presented.is_rested).tolist() == [0]
+
+
+@pytest.mark.parametrize("conditions", [[-1], [0, 0], [2]])
+def test_conditions_that_a_recording_lacks_cannot_be_chosen(conditions: list[int]) -> None:
+    times = np.arange(1.0, 9.0, 0.2)
+    source = recording([(1.005, 0)], times, frequency_hz=np.tile([5.0, 10.0], 20))
+    with pytest.raises(InvalidArgument, match="conditions: expected some of 0 to 1, each once, got"):
+        extract_responses(source, burst_threshold=1.0).only(conditions)

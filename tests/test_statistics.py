@@ -202,3 +202,12 @@ def test_the_interval_ends_where_the_numbers_can_be_no_larger() -> None:
     assert (bound.low, bound.value) == (free.low, free.value)
     assert interquartile_mean([3.0], within=(0.0, 5.0)).low == 0.0
     assert interquartile_mean([3.0], within=(0.0, 5.0)).high == 5.0
+
+
+@pytest.mark.parametrize("episodes", [3, 300])
+def test_returns_that_are_no_numbers_are_not_compared(episodes: int) -> None:
+    returns = np.arange(2.0 * episodes).reshape(2, -1)
+    wrong = np.where(returns == 1, np.nan, returns)
+    for ours, theirs, name in ((wrong, returns, "policies"), (returns, wrong, "control")):
+        with pytest.raises(InvalidArgument, match=f"{name}: expected finite numbers, got NaN"):
+            compare_episodes(ours, theirs)

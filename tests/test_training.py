@@ -500,3 +500,20 @@ def test_commands_are_taken_from_whatever_yields_them() -> None:
 def test_an_unknown_shadowing_is_refused() -> None:
     with pytest.raises(InvalidArgument, match="shadowing: expected True, False or 'drawn', got 'bogus'"):
         Training(Cartpole(), None, shadowing="bogus")  # type: ignore[arg-type]
+
+
+def test_what_conditions_deliver_decides_the_fingerprint() -> None:
+    """Its labels may be the same, as those of patterns are."""
+    timeline = timeline_of()
+    conditions = tuple(replace(each, electrodes=((7 + i,),)) for i, each in enumerate(timeline.conditions))
+    others = replace(timeline, conditions=conditions)
+    first, second = (describe(SHORT, each)["fingerprint"] for each in (timeline, others))
+    assert first != second and describe(SHORT, replace(timeline))["fingerprint"] == first
+
+
+@pytest.mark.parametrize("first_min", [33.1, 0.7, 1234.567])
+def test_simulators_change_with_the_chunk_whatever_the_minutes(first_min: float) -> None:
+    timeline = timeline_of(tuple(round(first_min + 10.0 * i, 3) for i in range(6)))
+    training = replace(SHORT, duration_min=60.0)
+    rows = [timeline.row_at(first_min + training.minute(i)) for i in range(60)]
+    assert rows == [i // 10 for i in range(60)]

@@ -175,6 +175,9 @@ class Animat(Environment[RobotState]):
     def respond(self, uniforms: Uniforms, state: State, action: Array, simulator: Neurons) -> Responded:
         if simulator is None:
             raise InvalidArgument("simulator: expected a neuron simulator, which an Animat needs, got None")
+        if simulator.n_conditions != self.n_conditions:
+            expected = f"expected {simulator.n_conditions}, those of the simulator, got {self.n_conditions}"
+            raise InvalidArgument(f"n_conditions: {expected}")
         expect_fit(self.robot.name, self.robot.n_commands, simulator.n_readouts)
         answer = simulator.answer(action, uniforms[self.robot.noise_size], state.neurons)
         command = decode(self.mapping, answer.rate_hz, simulator.percentiles)

@@ -27,7 +27,7 @@ from animat.recordings.metadata import from_metadata
 from animat.recordings.recording import Recording
 from animat.stimulation.stimulus import Stimuli
 from animat.tables import UNKNOWN
-from animat.writing import atomic_write, clear_leftovers, exclusive_lock, expect_writable
+from animat.writing import atomic_write, clear_leftovers, exclusive_lock, expect_writable, is_locked
 
 LOG_FILE = "session.log"
 RECORDING_FILE = "session.nwb"
@@ -270,7 +270,10 @@ def recover_session(path: str | os.PathLike[str], progress: Progress | None = No
         Mismatch: if the session is still running, or its table has more ticks than are left in a damaged log.
     """
     # Read before locking, so that the error for a folder without a session comes first.
-    with exclusive_lock(read_session(path).folder):
+    folder = read_session(path).folder
+    with exclusive_lock(folder), open_file(folder / LOG_FILE) as log:
+        # A running session holds it.
+        is_locked(folder, log.fileno())
         session = read_session(path)
         _expect_no_loss(session)
         clear_leftovers(session.folder, RECORDING_FILE, TICKS_FILE)

@@ -13,6 +13,7 @@ from animat.stimulation.schedule import Block
 
 LATE_S, LATE_PART = 0.001, 0.05
 """Stimuli that come later than planned by more than this, and than this part of their interval, are counted."""
+_LEAST_UNOBSERVED_S = 0.0005
 LATE_SHARE, LOST_SHARE = 0.1, 0.01
 """Shares of the stimuli, and of the frames or spikes, above which there is a warning."""
 
@@ -29,7 +30,7 @@ def shortfalls(
         rate_hz: frames per second.
     """
     lacks = [f"{count:,} {what}" for what, count in left_out.items()]
-    if unobserved_s:
+    if unobserved_s >= _LEAST_UNOBSERVED_S:
         lacks.append(f"{1000 * unobserved_s:.0f} ms between stretches")
     if lacks:
         n_frames = rate_hz * sum(observed.duration_s for _, observed in parts)

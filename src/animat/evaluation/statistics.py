@@ -280,7 +280,7 @@ class EpisodeComparison(NamedTuple):
 
 def compare_episodes(policies: ArrayLike, control: ArrayLike) -> EpisodeComparison:
     """Compare the returns (at least one, any shape) of all policies together with those of a control, by episodes."""
-    ours, theirs = np.ravel(policies), np.ravel(control)
+    ours, theirs = _samples("policies", np.ravel(policies)), _samples("control", np.ravel(control))
     u, p = mann_whitney(ours, theirs)
     p_exact = _exact_p(ours, theirs) if len(ours) * len(theirs) <= _MOST_EPISODE_PAIRS else None
     return EpisodeComparison(p, u / len(ours) / len(theirs), len(ours), len(theirs), p_exact)

@@ -124,21 +124,19 @@ def live(
         policies = run.shadow(progress)
         first, at_min = next(iter(policies.values())), run.used[-1].start_min
         calibration = Calibration.of_series(run.used, first, at_min=at_min, adaptive=adaptive, kind=kind)
-        # Its own lock, so that nobody recovers the session while it is running.
-        with exclusive_lock(run.folder / SESSION):
-            gap = run_policies(
-                policies,
-                culture,
-                calibration,
-                run.folder / SESSION,
-                episodes=episodes,
-                with_controls=with_controls,
-                seed=training.seed,
-                account=run.account,
-                progress=progress,
-                report=report,
-                **settings,
-            )
+        gap = run_policies(
+            policies,
+            culture,
+            calibration,
+            run.folder / SESSION,
+            episodes=episodes,
+            with_controls=with_controls,
+            seed=training.seed,
+            account=run.account,
+            progress=progress,
+            report=report,
+            **settings,
+        )
         run.write("closed loop", **gap.session.to_dict())
         # If the culture failed or hangs, its state may be inconsistent; that after its last recording is not.
         if gap.session.ending.by not in ("culture", "hang"):

@@ -69,6 +69,7 @@ class Ranked:
         rank: of each, the share of non-burst responses below it, ties counted half.
         means: the mean rank of each condition's non-burst responses.
         rows: of each condition, the responses that can be drawn.
+        rests: whether its trials come after silence, as a rule.
     """
 
     def __init__(self, responses: Responses) -> None:
@@ -80,6 +81,8 @@ class Ranked:
         self.means = np.array([self.rank[rows].mean() for rows in usable])
         known = ~np.isnan(responses.last_hz)
         self.rows = [rows[known[rows]] if known[rows].any() else rows for rows in usable]
+        rested = [self._presented.is_rested[self._presented.condition == c] for c in conditions]
+        self.rests = np.array([len(of) > 0 and 2 * np.count_nonzero(of) > len(of) for of in rested])
 
     def traces(self, memory: Memory) -> Float64[np.ndarray, " responses"]:
         """The trace before each response."""

@@ -10,10 +10,10 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Float64, Int, Int64
+from jaxtyping import Array, Bool, Float, Float64, Int, Int64
 
 from animat.arguments import checked_arguments
-from animat.neurons.history import NO_MEMORY, Memory, Ranked, trace_increment
+from animat.neurons.history import INITIAL_HISTORY, NO_MEMORY, Memory, Ranked, trace_increment
 from animat.neurons.simulator import Answer, EmpiricalSimulator, Index, Rates, Scalar, Stored, fit_empirical, to_jax
 from animat.responses.responses import Responses
 from animat.tables import briefly
@@ -54,6 +54,7 @@ class MemorySimulator(EmpiricalSimulator):
         kept: the share of the load that is left when a trial of each condition comes, shape (conditions,).
         added: c, what a trial adds to the load.
         decay, weight, neighbour_exponent, load_s: as in `Memory`.
+        rests: whether trials of each condition come after silence, so that the trace is 0; None: none do.
 
     Source: the nearest-neighbour bootstrap of Lall and Sharma 1996 (doi:10.1029/95WR02966), of one number, unweighted.
     """
@@ -73,6 +74,7 @@ class MemorySimulator(EmpiricalSimulator):
     weight: Float[Stored, "*recordings"]
     neighbour_exponent: Float[Stored, "*recordings"]
     load_s: Float[Stored, "*recordings"]
+    rests: Bool[Stored, "*recordings conditions"] | None = None
 
     has_memory: ClassVar[bool] = True
 
@@ -83,7 +85,8 @@ class MemorySimulator(EmpiricalSimulator):
 
     def answer(self, condition: Index, uniform: Scalar, history: Float[Array, "2"]) -> Answer:
         load = jnp.asarray(self.kept)[condition] * history[1]
-        rate_hz, trace = self.answer_at(condition, uniform, history[0], load)
+        trace = history[0] if self.rests is None else jnp.where(jnp.asarray(self.rests)[condition], 0.0, history[0])
+        rate_hz, trace = self.answer_at(condition, uniform, trace, load)
         return Answer(rate_hz, jnp.stack([trace, load + jnp.asarray(self.added)]))
 
     def answer_at(self, condition: Index, uniform: Scalar, trace: Scalar, load: Scalar) -> tuple[Rates, Scalar]:
@@ -146,6 +149,9 @@ def fit_memory(responses: Responses, *, room: int | None = None, memory: Memory 
         histories[condition, : len(rows)] = state[in_order]
         after[condition, : len(rows)] = responses.read_hz[in_order]
         left[condition, : len(rows)] = trace_increment(ranked.rank[in_order], ranked.means[condition], memory)
+    if memory == NO_MEMORY:
+        # What policies see of it in a loop (`HistoryTracker.observed`).
+        left[:] = INITIAL_HISTORY[0]
     followers = np.array([len(rows) for rows in ranked.rows])
     return MemorySimulator(
         values.values_hz,
@@ -157,7 +163,10 @@ def fit_memory(responses: Responses, *, room: int | None = None, memory: Memory 
         to_jax(left),
         to_jax(followers, np.int32),
         to_jax(np.rint(followers**memory.neighbour_exponent), np.int32),
-        *map(to_jax, (toward, load.kept, load.added, *memory)),
+        to_jax(toward),
+        to_jax(load.kept),
+        *map(to_jax, (load.added, *memory)),  # type: ignore[misc]
+        rests=to_jax(ranked.rests, np.bool_),
     )
 
 
@@ -166,12 +175,11 @@ def _find_memory(ranked: Ranked) -> Memory:
     if not rows:
         return NO_MEMORY
     # With all responses as neighbours the history does not matter.
-    errors = {NO_MEMORY: _errors(ranked.rank, rows, 1.0)}
+    errors = {NO_MEMORY: _errors(ranked.rank, np.zeros(len(ranked.rank)), rows, 1.0)}
     for decay, weight in itertools.product(_DECAYS, _WEIGHTS):
         history = ranked.traces(Memory(decay, weight, 1.0))
-        in_order = [each[np.argsort(history[each], kind="stable")] for each in rows]
         for neighbour_exponent in _EXPONENTS:
-            errors[Memory(decay, weight, neighbour_exponent)] = _errors(ranked.rank, in_order, neighbour_exponent)
+            errors[Memory(decay, weight, neighbour_exponent)] = _errors(ranked.rank, history, rows, neighbour_exponent)
     best = min(errors, key=lambda memory: float(errors[memory].mean()))
 
     def is_as_good(memory: Memory, standard_errors: float) -> bool:
@@ -241,15 +249,26 @@ def _slopes(
 
 
 def _errors(
-    rank: Float64[np.ndarray, " responses"], in_order: Sequence[Int64[np.ndarray, " rows"]], neighbour_exponent: float
+    rank: Float64[np.ndarray, " responses"],
+    history: Float64[np.ndarray, " responses"],
+    of_conditions: Sequence[Int64[np.ndarray, " rows"]],
+    neighbour_exponent: float,
 ) -> Float64[np.ndarray, " rows"]:
-    """Squared differences of each rank from the mean rank of its n^neighbour_exponent neighbours by history."""
+    """Squared differences of each rank from the mean rank of its n^neighbour_exponent neighbours by history.
+
+    If more have the same history, all of these are neighbours, as in `MemorySimulator.rows_near`: their order is that
+    of time, in which drift would look like a memory.
+    """
     errors = np.full(len(rank), np.nan)
-    for rows in in_order:
-        n = len(rows)
+    for of_condition in of_conditions:
+        rows = of_condition[np.argsort(history[of_condition], kind="stable")]
+        n, at = len(rows), history[rows]
         k = int(min(np.rint(n**neighbour_exponent), n - 1))
+        smaller, no_larger = at.searchsorted(at, "left"), at.searchsorted(at, "right")
         first = np.clip(np.arange(n) - k // 2, 0, n - k - 1)
+        is_common = no_larger - smaller > k + 1
+        begin, end = np.where(is_common, smaller, first), np.where(is_common, no_larger, first + k + 1)
         below = np.concatenate([[0.0], np.cumsum(rank[rows])])
-        others = below[first + k + 1] - below[first] - rank[rows]
-        errors[rows] = (rank[rows] - others / k) ** 2
+        others = below[end] - below[begin] - rank[rows]
+        errors[rows] = (rank[rows] - others / (end - begin - 1)) ** 2
     return np.asarray(errors[~np.isnan(errors)])

@@ -15,7 +15,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from animat.arguments import checked_arguments
-from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch, in_min
+from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch, in_min, shown
 from animat.neurons.fidelity import Fidelity, fidelity
 from animat.neurons.history import Memory
 from animat.neurons.memory import MemorySimulator, fit_memory
@@ -57,6 +57,8 @@ _KINDS = {
 
 ALONE_MIN = 10.0
 """How long the simulator of a single recording holds: the paper's interval."""
+_ROUNDING_MIN = 1e-9
+"""Of minutes that are sums."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +108,7 @@ class SimulatorTimeline:
 
     def row_at(self, minute: float) -> int:
         """The newest recording at a minute: the last one that started at or before it (before all: the first)."""
-        return max(0, int(np.searchsorted(self.start_min, minute, side="right")) - 1)
+        return max(0, int(np.searchsorted(self.start_min, minute + _ROUNDING_MIN, side="right")) - 1)
 
     def requested_row(self, minute: float) -> int:
         """The same for a minute that a user gave; raises InvalidArgument for one before the first recording, or NaN."""
@@ -123,7 +125,9 @@ class SimulatorTimeline:
 
     def with_percentiles(self, which: str) -> SimulatorTimeline:
         """These simulators, each with its own percentiles (`"moving"`) or with the first recording's (`"first"`)."""
-        if which != "first":
+        if which not in ("moving", "first"):
+            raise InvalidArgument(f"which: expected moving or first, got {shown(which)}")
+        if which == "moving":
             return self
         percentiles = np.asarray(self.simulators.percentiles)
         held = to_jax(np.broadcast_to(percentiles[:1], percentiles.shape), None)

@@ -132,6 +132,8 @@ class Recording:
             length = ", the latter 0 or more" if self.duration_s < 0 else ""
             expected = f"start_s, duration_s: expected finite seconds within a century{length}"
             raise UnusableData(f"{expected}, got {self.start_s:g} and {self.duration_s:g}")
+        if self.recorded_at is not None and self.recorded_at.tzinfo is None:
+            raise UnusableData(f"recorded_at: expected a date with a time zone, got {self.recorded_at}")
         if not abs(self.start_min) <= CENTURY_S / 60:
             raise UnusableData(f"start_min: expected finite minutes within a century, got {self.start_min:g}")
         if self.sampling_rate_hz <= 0 or self.sampling_rate_hz > FASTEST_HZ:

@@ -13,15 +13,23 @@ from animat.recordings.findings import Finding
 from animat.recordings.quality import recording_findings
 from animat.recordings.recording import Recording, ResponseTable
 from animat.responses.bursts import separate_bursts
-from animat.responses.conditions import NO_CONDITION, ByInterval, Conditions, conditions_named, default_conditions
+from animat.responses.conditions import (
+    NO_CONDITION,
+    Assignment,
+    ByInterval,
+    Conditions,
+    conditions_named,
+    default_conditions,
+)
 from animat.responses.quality.one_culture import series_findings
 from animat.responses.quality.responses import findings_on
 from animat.responses.readouts import ALL, Readouts, readouts_on
 from animat.responses.responses import Responses, Trials
 from animat.responses.windows import DEFAULT_WINDOW_MS, Window, check_window, read_windows
+from animat.stimulation.stimulus import Stimuli
 
-SILENCE_S = 1.0
-"""A longer time without a pulse is silence: the slowest of the paper's stimuli are 0.2 s apart."""
+SILENCE_S = 1.05
+"""A longer time without a pulse is silence; not that between pulses at 1 Hz, which come a little early or late."""
 REFUSING = (
     "no-stimuli",
     "no-spikes",
@@ -80,7 +88,7 @@ def extract_responses(
         raise UnusableData(f"channels: expected at least one, got a {what} without any; x is a mean over channels")
     readouts = readouts_on(readouts, source.channels)
     by = conditions_named(by) if isinstance(by, str) else by or default_conditions(stimuli, source.protocol)
-    assignment = by.assign(stimuli)
+    assignment = _without_rests(by.assign(stimuli), stimuli)
     # Trials without a condition are read too, as the history of others.
     read, inside = stimuli.is_last_of_presentation, None
     assumed: tuple[Finding, ...] = ()
@@ -137,6 +145,13 @@ def extract_responses(
         recording=source.without_spikes() if isinstance(source, Recording) else None,
     )
     return replace(responses, findings=(*assumed, *findings_on(responses, source, assignment, bursts, inside)))
+
+
+def _without_rests(assignment: Assignment, stimuli: Stimuli) -> Assignment:
+    """Rests without the condition that they share with pulses: what is read after one is no response to a stimulus."""
+    pulsed = np.unique(assignment.condition[~stimuli.is_rest])
+    shared = stimuli.is_rest & np.isin(assignment.condition, pulsed)
+    return replace(assignment, condition=np.where(shared, NO_CONDITION, assignment.condition))
 
 
 def _window_of(table: ResponseTable, by: Conditions, window_ms: Window) -> tuple[Window, tuple[Finding, ...]]:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-from animat.errors import Mismatch, UnusableData
+from animat.errors import InvalidArgument, Mismatch, UnusableData
 from animat.recordings.findings import Finding
 from animat.recordings.recorded_culture import RecordedCulture
 from animat.recordings.recording import Channels, Recording
@@ -30,7 +30,7 @@ class Trials:
 
     Attributes:
         condition: index of each, `NO_CONDITION` if it has none.
-        is_rested: whether there was no pulse in the second before it.
+        is_rested: whether there was no pulse for `extraction.SILENCE_S` before it.
         time_s: of the pulse after which it was read; None if it is not known.
     """
 
@@ -213,7 +213,13 @@ class Responses:
         return replace(self.at_rows(drawn), findings=())
 
     def only(self, conditions: Sequence[int]) -> Responses:
-        """The responses to some conditions, by index; their history is kept."""
+        """The responses to some conditions, by index, each once; their history is kept.
+
+        Raises InvalidArgument for another index.
+        """
+        if len({*conditions}) < len(conditions) or not {*conditions} <= {*range(len(self.conditions))}:
+            expected = f"some of 0 to {len(self.conditions) - 1}, each once"
+            raise InvalidArgument(f"conditions: expected {expected}, got {', '.join(map(str, conditions))}")
         index = np.full(len(self.conditions) + 1, NO_CONDITION)
         index[list(conditions)] = np.arange(len(conditions))
         kept = self.at_rows(np.flatnonzero(index[self.condition] != NO_CONDITION))

@@ -83,7 +83,10 @@ def describe(
         "versions": versions_of(("animat", "jax", "jaxlib", "numpy", "optax"), [training.robot], device),
     }
     leaves = jax.tree.leaves(timeline.simulators if timeline else ())
-    manifest = with_fingerprint(decisive, *(np.ascontiguousarray(leaf).tobytes() for leaf in leaves))
+    # What conditions deliver, too: policies contain it, and may pay for it.
+    delivered = "".join(str(asdict(condition)) for condition in timeline.conditions) if timeline else ""
+    contents = (np.ascontiguousarray(leaf).tobytes() for leaf in leaves)
+    manifest = with_fingerprint(decisive, delivered.encode(), *contents)
     culture = {} if timeline is None or timeline.culture is None else {"culture": asdict(timeline.culture)}
     # File names do not count: the same recordings in another place are the same.
     informative = {"sources": list(sources), **({} if random_return is None else {"random_return": random_return})}

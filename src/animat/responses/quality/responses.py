@@ -102,7 +102,9 @@ def _left_out(
         )
         yield Finding("no-condition", "refuse", message, float(without))
     elif without:
-        message = f"left out, as they belong to no condition: {without:,} of {n_read:,} stimuli"
+        rests = int(np.count_nonzero(read & ~has_condition & stimuli.is_rest))
+        of_these = f", {rests:,} of which deliver nothing (--conditions electrode)" if rests else ""
+        message = f"left out, as they belong to no condition: {without:,} of {n_read:,} stimuli{of_these}"
         yield Finding("no-condition", "note", message, float(without))
     if inside is not None and (late := int(np.count_nonzero(read & has_condition & ~inside))):
         message = f"left out, as their window runs past the end of the recording: {late:,} of {n_read:,} stimuli"
