@@ -8,6 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jax
 import numba
 import pytest
 
@@ -97,3 +98,15 @@ def test_a_home_that_is_a_file_keeps_nothing_and_says_nothing(tmp_path: Path) ->
         check=False,
     )
     assert (done.returncode, done.stdout, done.stderr) == (0, "1 int32 None\nTrue\n", "")
+
+
+@pytest.mark.oracle
+@pytest.mark.parametrize("setting", [{}, {"JAX_DEFAULT_PRNG_IMPL": "rbg"}, {"JAX_THREEFRY_PARTITIONABLE": "0"}])
+def test_random_numbers_are_those_of_any_other_process(setting: dict[str, str]) -> None:
+    program = (
+        "from animat.compilation import keep_compilations; keep_compilations()\n"
+        "import jax; print(jax.random.bits(jax.random.fold_in(jax.random.key(3), 1), (3,)).tolist())"
+    )
+    done = subprocess.run([sys.executable, "-c", program], env=os.environ | setting, capture_output=True, text=True)
+    expected = jax.random.bits(jax.random.fold_in(jax.random.key(3), 1), (3,)).tolist()
+    assert done.stdout == f"{expected}\n"

@@ -47,12 +47,15 @@ def cache_folder() -> Path:
 def keep_compilations() -> None:
     """Let JAX keep what it compiles in `cache_folder()`, if that is writable; for a process that will compile.
 
-    It also turns off 64 bits, whatever `JAX_ENABLE_X64` says, on which results must not depend, and hides everything
-    imported so far from the garbage collector: scanning all of JAX again and again took a quarter of the tracing time.
+    It also turns off 64 bits and other generators of random numbers, whatever the environment says, on which results
+    must not depend, and hides everything imported so far from the garbage collector: scanning all of JAX again and
+    again took a quarter of the tracing time.
     """
     import jax
 
     jax.config.update("jax_enable_x64", False)
+    jax.config.update("jax_default_prng_impl", "threefry2x32")
+    jax.config.update("jax_threefry_partitionable", True)
     gc.freeze()
     folder = cache_folder()
     try:
