@@ -28,7 +28,8 @@ html_show_sourcelink = False
 _GUIDE = (
     *("recordings", "cultures", "virtual-culture", "hardware", "recording-a-culture", "responses"),
     *("robots", "own-robots", "goals", "training", "lessons", "evaluation", "closed-loop", "reality-gap", "live"),
-    *("agents", "studies", "tuning", "watch", "cluster", "gymnasium", "api", "architecture", "dependencies"),
+    *("session-files", "policy-file", "agents", "studies", "tuning", "watch", "cluster", "gymnasium", "api"),
+    *("architecture", "dependencies"),
 )
 """Pages in the order of the story."""
 

@@ -51,8 +51,19 @@ SILENCES = 5
 def time_findings(recording: Recording) -> Iterator[Finding]:
     """A finding on times that cannot be in seconds (`times-not-in-seconds`), or contradict stated frequencies.
 
-    docs/recordings.md has the cases. An unknown common factor is a warning only: trains of 100 pulses, one row each,
-    have intervals 100 times as long as stated. Stimuli that come later than stated may have pauses between them.
+    Another unit is named in these cases, of which all but the first need 1,000 spikes:
+
+    - the intervals between stimuli all differ from those of stated frequencies by the same factor, that of a unit:
+      milli-, micro- and nanoseconds, minutes, hours, or samples at the recording's rate; the highest frequency must be
+      at least 1.5 times the lowest;
+    - the recording would last over two hours, the median channel fires below 0.02 Hz, and less than 5 % of the
+      intervals within channels are under 0.5 s;
+    - it would last over two hours, and no spike lies within 100 ms after any of 20 or more stimuli;
+    - the median channel fires above 200 Hz;
+    - nine in ten stimuli come after the last spike, or before the first.
+
+    Any other common factor above 30 or below 1/30 is a warning only: trains of 100 pulses, one row each, have intervals
+    100 times as long as stated. Stimuli that come later than stated may have pauses between them.
     """
     stated = _common_factor(recording.stimuli, recording.sampling_rate_hz)
     if stated is not None and stated.severity == "refuse":
