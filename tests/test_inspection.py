@@ -463,6 +463,7 @@ def test_another_ending_is_refused(tmp_path: Path) -> None:
         save_figure(figure, tmp_path / "figure.xyz")
 
 
+@pytest.mark.oracle
 def test_the_users_settings_of_matplotlib_do_not_change_a_commands_figures(tmp_path: Path) -> None:
     (tmp_path / "matplotlib").mkdir()
     (tmp_path / "matplotlib/matplotlibrc").write_text("text.usetex: True\nlines.linewidth: 9\nfont.size: 30\n")

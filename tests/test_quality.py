@@ -232,6 +232,7 @@ def test_channels_that_stop() -> None:
         assert "stopped-channels" not in found((channel != 7) | is_kept)
 
 
+@pytest.mark.oracle
 @given(st.integers(0, 2**32 - 1))
 def test_channels_of_any_rate_hardly_ever_stop_by_chance(seed: int) -> None:
     rng = np.random.default_rng(seed)
