@@ -333,6 +333,19 @@ def test_a_recording_that_cannot_be_used_is_kept_and_passed_over(tmp_path: Path)
     assert [line["message"] for line in lines(tmp_path / "live") if line["what"] == "unusable"] == ["a dead window"]
 
 
+def test_a_first_recording_that_cannot_be_used_ends_it_and_says_why(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def extract(recordings: Any) -> Any:
+        raise UnusableData("recording_0000_min.nwb: a dead window")
+
+    monkeypatch.setattr("animat.live.shadowing.extract_series", extract)
+    expected = r"recording: expected the first one to be usable, got one that is not: recording_0000_min.nwb: a dead"
+    with FakeCulture() as culture, pytest.raises(UnusableData, match=expected):
+        live(ONE, culture, PROTOCOL, tmp_path / "live", timetable=QUICK, episodes=1, adaptive=False)
+    assert [line["what"] for line in lines(tmp_path / "live")][1] == "unusable"
+
+
 class Pressing:
     """A progress at which a person presses Ctrl-C once there was a swap."""
 

@@ -180,8 +180,7 @@ class _Run:
     def shadow(self, progress: Progress | None) -> dict[str, Policy]:
         """Record and train to the end; returns the policies."""
         timeline = self._record(0, in_phase(progress, "recording"))
-        if timeline is None:
-            raise UnusableData("recording: expected the first one to be usable, got one that is not; see live.log")
+        assert timeline is not None
         groups = groups_of(self.training, timeline, describe(self.training, timeline))
         minutes, policies = self.timetable.duration_min, self.folder / POLICIES
         progress = in_phase(progress, "training", minutes, "min of the culture")
@@ -249,7 +248,7 @@ class _Run:
         self.culture.rest(max(0.0, self._zero_s + 60 * minute - self.culture.now_s))
 
     def _record(self, number: int, progress: Progress) -> SimulatorTimeline | None:
-        """Record and fit; returns None, and logs why, if the recording cannot be trained on."""
+        """Record and fit; returns None, and logs why, if the recording cannot be trained on; the first one has to be."""
         began_s = time.monotonic()
         folder = self.folder / RECORDINGS
         # Locked as by `animat record`, so that viewers know that it is in progress.
@@ -270,6 +269,9 @@ class _Run:
             timeline = fit_timeline(series, kind=self.kind).with_percentiles(self.training.percentiles)
         except (UnusableData, Mismatch) as error:
             self.write("unusable", file=file.name, message=str(error))
+            if not self.used:
+                expected = "recording: expected the first one to be usable, got one that is not"
+                raise UnusableData(f"{expected}: {error}") from error
             return None
         self.used = series
         took_s = round(time.monotonic() - began_s, 2)
