@@ -104,14 +104,21 @@ class Called(Actor):
                     raise InvalidArgument(f"agents: {self.name}: act: {expected}, got {chosen}, then {again}: {remedy}")
         if (failure := self._failure) is not None:
             self._failure = None
+            if isinstance(failure, KeyboardInterrupt):
+                # Ctrl-C, where JAX called this in the main thread.
+                raise failure
             what = str(failure) if isinstance(failure, InvalidArgument) else first_line(failure)
             raise InvalidArgument(f"agents: {self.name}: {what}") from failure
 
 
 def begun(controller: Controller) -> Controller:
     """What acts in one episode: the controller itself, unless it remembers."""
-    begin = getattr(controller, "begin", None)
-    return begin() if callable(begin) else controller
+    if not callable(begin := getattr(controller, "begin", None)):
+        return controller
+    acting: Controller = begin()
+    if not callable(getattr(acting, "act", None)):
+        raise InvalidArgument(f"begin: expected what acts in the next episode, got {shown(acting)}")
+    return acting
 
 
 def _asked(controller: Controller, observation: np.ndarray, uniform: float) -> Any:

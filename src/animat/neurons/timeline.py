@@ -201,7 +201,9 @@ def fit_timeline(
 
 def save_timeline(timeline: SimulatorTimeline, path: Path) -> Path:
     """Write the simulators as safetensors, with everything but arrays as JSON metadata; always the same bytes."""
-    arrays = {name: np.ascontiguousarray(array) for name, array in vars(timeline.simulators).items()}
+    # Those that an older version wrote may lack some.
+    known = {name: array for name, array in vars(timeline.simulators).items() if array is not None}
+    arrays = {name: np.ascontiguousarray(array) for name, array in known.items()}
     metadata = {
         "kind": type(timeline.simulators).__name__,
         "start_min": timeline.start_min.tolist(),

@@ -84,7 +84,7 @@ def describe(
     }
     leaves = jax.tree.leaves(timeline.simulators if timeline else ())
     # What conditions deliver, too: policies contain it, and may pay for it.
-    delivered = "".join(str(asdict(condition)) for condition in timeline.conditions) if timeline else ""
+    delivered = json.dumps([asdict(condition) for condition in timeline.conditions] if timeline else [])
     contents = (np.ascontiguousarray(leaf).tobytes() for leaf in leaves)
     manifest = with_fingerprint(decisive, delivered.encode(), *contents)
     culture = {} if timeline is None or timeline.culture is None else {"culture": asdict(timeline.culture)}
