@@ -109,6 +109,11 @@ class BeginsWith(Plain):
         return self.begun
 
 
+class Itself(Plain):
+    def begin(self) -> Any:
+        return self
+
+
 def five_conditions() -> SimulatorTimeline:
     return fit_timeline([answers([60] * 5, 1)], kind="histogram")
 
@@ -155,7 +160,13 @@ def test_an_agent_outside_jax_is_evaluated_as_one_in_jax_and_a_policy_as_itself(
             Wrong(ZeroDivisionError("no")),
             r"agents: mine: ZeroDivisionError: no \(.*test_own_agents.py, line \d+\)",
         ),
-        ("mine", BeginsWith(None), "agents: mine: begin: expected what acts in the next episode, got None"),
+        ("mine", BeginsWith(None), "agents: mine: begin: expected another object, which acts in .*, got None"),
+        ("mine", Itself(), "agents: mine: begin: expected another object, .*, got the agent itself"),
+        (
+            "mine",
+            BeginsWith(Plain()),
+            "agents: mine: begin: expected another object for each .*, got the same one twice",
+        ),
         (
             "mine",
             Unregistered(),

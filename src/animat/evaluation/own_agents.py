@@ -73,7 +73,10 @@ class Called(Actor):
             return 0
         try:
             if episode == len(self._in_episodes):
-                self._in_episodes.append(begun(self.controller))
+                acting = begun(self.controller)
+                if acting is not self.controller and any(acting is other for other in self._in_episodes):
+                    raise InvalidArgument("begin: expected another object for each episode, got the same one twice")
+                self._in_episodes.append(acting)
             chosen = _expect_condition(_asked(self._in_episodes[episode], observation, uniform), n_actions)
         except BaseException as error:
             self._failure = error
@@ -116,8 +119,9 @@ def begun(controller: Controller) -> Controller:
     if not callable(begin := getattr(controller, "begin", None)):
         return controller
     acting: Controller = begin()
-    if not callable(getattr(acting, "act", None)):
-        raise InvalidArgument(f"begin: expected what acts in the next episode, got {shown(acting)}")
+    if acting is controller or not callable(getattr(acting, "act", None)):
+        got = "the agent itself" if acting is controller else shown(acting)
+        raise InvalidArgument(f"begin: expected another object, which acts in the next episode, got {got}")
     return acting
 
 

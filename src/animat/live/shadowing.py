@@ -124,19 +124,21 @@ def live(
         policies = run.shadow(progress)
         first, at_min = next(iter(policies.values())), run.used[-1].start_min
         calibration = Calibration.of_series(run.used, first, at_min=at_min, adaptive=adaptive, kind=kind)
-        gap = run_policies(
-            policies,
-            culture,
-            calibration,
-            run.folder / SESSION,
-            episodes=episodes,
-            with_controls=with_controls,
-            seed=training.seed,
-            account=run.account,
-            progress=progress,
-            report=report,
-            **settings,
-        )
+        # Its own lock, by which viewers know that it is running.
+        with exclusive_lock(run.folder / SESSION):
+            gap = run_policies(
+                policies,
+                culture,
+                calibration,
+                run.folder / SESSION,
+                episodes=episodes,
+                with_controls=with_controls,
+                seed=training.seed,
+                account=run.account,
+                progress=progress,
+                report=report,
+                **settings,
+            )
         run.write("closed loop", **gap.session.to_dict())
         # If the culture failed or hangs, its state may be inconsistent; that after its last recording is not.
         if gap.session.ending.by not in ("culture", "hang"):
@@ -248,7 +250,7 @@ class _Run:
         self.culture.rest(max(0.0, self._zero_s + 60 * minute - self.culture.now_s))
 
     def _record(self, number: int, progress: Progress) -> SimulatorTimeline | None:
-        """Record and fit; returns None, and logs why, if the recording cannot be trained on; the first one has to be."""
+        """Record and fit; returns None, and logs why, if a recording cannot be trained on, but raises for the first."""
         began_s = time.monotonic()
         folder = self.folder / RECORDINGS
         # Locked as by `animat record`, so that viewers know that it is in progress.
