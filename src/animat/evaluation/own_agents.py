@@ -53,7 +53,7 @@ class Called(Actor):
         self.name, self.controller = name, controller
         self._failure: BaseException | None = None
         self._in_episodes: list[Controller] = []
-        self._answers: list[tuple[np.ndarray, float, int]] = []
+        self._answers: list[tuple[np.ndarray, float, int, int]] = []
 
     def act(self, environment: Environment[Any], observation: Seen, uniforms: Uniforms) -> Array:
         n, seen = environment.n_actions or 0, observation * environment.scales
@@ -77,12 +77,13 @@ class Called(Actor):
                 if acting is not self.controller and any(acting is other for other in self._in_episodes):
                     raise InvalidArgument("begin: expected another object for each episode, got the same one twice")
                 self._in_episodes.append(acting)
-            chosen = _expect_condition(_asked(self._in_episodes[episode], observation, uniform), n_actions)
+            rng = np.random.default_rng(int(uniform * _GRID))
+            chosen = _expect_condition(self._in_episodes[episode].act(np.array(observation), rng), n_actions)
         except BaseException as error:
             self._failure = error
             return 0
         if not episode and len(self._answers) < _ASKED_AGAIN:
-            self._answers.append((np.array(observation), uniform, chosen))
+            self._answers.append((np.array(observation), uniform, n_actions, chosen))
         return chosen
 
     def begin(self) -> None:
@@ -99,12 +100,12 @@ class Called(Actor):
                 raise
 
     def expect_no_failure(self) -> None:
-        if self._failure is None and not hasattr(self.controller, "begin"):
-            for observation, uniform, chosen in self._answers:
-                if (again := _asked(self.controller, observation, uniform)) != chosen:
-                    expected = "expected one condition for the same observation and random numbers"
-                    remedy = "draw only from rng, and give an agent that remembers a method begin (docs/agents.md)"
-                    raise InvalidArgument(f"agents: {self.name}: act: {expected}, got {chosen}, then {again}: {remedy}")
+        for observation, uniform, n_actions, chosen in [] if hasattr(self.controller, "begin") else [*self._answers]:
+            again = self._choose(0, observation, uniform, n_actions)
+            if again != chosen and self._failure is None:
+                expected = "expected one condition for the same observation and random numbers"
+                remedy = "draw only from rng, and give an agent that remembers a method begin (docs/agents.md)"
+                self._failure = InvalidArgument(f"act: {expected}, got {chosen}, then {again}: {remedy}")
         if (failure := self._failure) is not None:
             self._failure = None
             if isinstance(failure, KeyboardInterrupt):
@@ -123,10 +124,6 @@ def begun(controller: Controller) -> Controller:
         got = "the agent itself" if acting is controller else shown(acting)
         raise InvalidArgument(f"begin: expected another object, which acts in the next episode, got {got}")
     return acting
-
-
-def _asked(controller: Controller, observation: np.ndarray, uniform: float) -> Any:
-    return controller.act(np.array(observation), np.random.default_rng(int(uniform * _GRID)))
 
 
 @final
