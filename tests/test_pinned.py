@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import os
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
+from animat import process
 from animat.errors import UnsafeStimulus
 from animat.execution.pinned import PinnedProcesses
 from worker_tasks import describe_process, die, refuse, rest
@@ -21,6 +23,16 @@ CORE = min(os.sched_getaffinity(0))
 def one() -> Iterator[Executor]:
     with PinnedProcesses([CORE]) as executor:
         yield executor
+
+
+@pytest.mark.skipif(not Path("/proc/self/cmdline").exists(), reason="the processes of others are not known here")
+def test_a_run_takes_the_cores_that_others_leave(one: Executor, monkeypatch: pytest.MonkeyPatch) -> None:
+    one.submit(divmod, 7, 2).result()
+    assert process._pinned_processes()[CORE] >= 1
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {0, 1, 2, 5}, raising=False)
+    monkeypatch.setattr(process, "_pinned_processes", lambda: Counter({0: 2, 1: 1, 5: 1}))
+    of_each = [process.own_cores(most) for most in (1, 2, 3, 4, 9, None)]
+    assert of_each == [[2], [1, 2], [1, 2, 5], [0, 1, 2, 5], [0, 1, 2, 5], [0, 1, 2, 5]]
 
 
 @pytest.mark.parametrize("make", [lambda: PinnedProcesses([CORE]), lambda: ThreadPoolExecutor(1)])

@@ -9,6 +9,7 @@ import select
 import signal
 import subprocess
 import sys
+from collections import Counter
 from concurrent.futures import BrokenExecutor
 from contextlib import suppress
 from pathlib import Path
@@ -138,9 +139,24 @@ def pin_worker(core: int | None) -> None:
 
 
 def own_cores(most: int | None = None) -> list[int]:
-    """The cores that this process may use, at most `most` of them."""
-    cores = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else range(os.cpu_count() or 1)
-    return sorted(cores)[:most]
+    """The cores that this process may use, rising; at most `most` of them, with the fewest processes of other runs."""
+    cores = sorted(os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else range(os.cpu_count() or 1))
+    if most is None or most >= len(cores):
+        return cores
+    pinned = _pinned_processes()
+    return sorted(sorted(cores, key=lambda core: pinned[core])[:most])
+
+
+def _pinned_processes() -> Counter[int]:
+    """How many processes of this module are pinned to each core, whoever started them."""
+    pinned = Counter[int]()
+    for file in Path("/proc").glob("[0-9]*/cmdline"):
+        # It may have ended, or be hidden.
+        with suppress(OSError):
+            words = file.read_bytes().split(b"\0")
+            if b"animat.process" in words[:-2] and words[-2].isdigit():
+                pinned[int(words[-2])] += 1
+    return pinned
 
 
 def end_with_parent() -> None:
