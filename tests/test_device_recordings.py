@@ -15,9 +15,10 @@ from animat.cli import main
 from animat.cultures.base import Culture
 from animat.cultures.budget import Account, record_within
 from animat.cultures.devices.cl1 import CL1_PULSE, CL1Culture
-from animat.cultures.observed import Observed
+from animat.cultures.observed import Observed, Spikes
 from animat.cultures.safety import Admitted
 from animat.cultures.series import record_series
+from animat.cultures.shortfalls import shortfalls
 from animat.cultures.under_way import UNDER_WAY, PartialRecording
 from animat.errors import DeviceFailed, InvalidFile
 from animat.recordings.formats.nwb import write_nwb
@@ -25,6 +26,7 @@ from animat.recordings.reading import read_recording, read_recordings
 from animat.recordings.recording import Recording
 from animat.stimulation.protocol import Protocol
 from animat.stimulation.pulse import BALANCED_PULSE
+from animat.stimulation.schedule import make_schedule
 from stand_in_cl import Neurons
 from stand_in_cl import install as install_cl
 from stand_in_maxlab import Rig
@@ -305,3 +307,13 @@ def test_record_says_where_a_killed_run_s_recording_is(
     kept = tmp_path / "interrupted" / "recording_0000_min.nwb"
     assert f"what a run that was killed had recorded is in {kept}" in capsys.readouterr().err
     assert main(record) == 0 and "killed" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("unobserved_s", "expected"), [(0.0, []), (0.0004, []), (0.0006, ["1 ms between stretches"])])
+def test_less_than_half_a_millisecond_between_stretches_is_not_reported(
+    unobserved_s: float, expected: list[str]
+) -> None:
+    (block,) = make_schedule(MIXED, np.arange(20)[:, None], 1).blocks
+    observed = Observed(0.0, block.duration_s, Spikes(np.empty(0), np.empty(0, np.int64)), block.stimuli.time_s)
+    found = shortfalls([(block, observed)], {}, unobserved_s, 20_000.0)
+    assert [finding.message.partition("lacks: ")[2] for finding in found] == expected

@@ -74,6 +74,17 @@ class Unregistered(Actor):
         return jnp.zeros(len(observation), int)
 
 
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Tabular(Actor):
+    """A condition for each fifth of the first quantity, from -1 to 1."""
+
+    table: Any
+
+    def act(self, environment: Any, observation: Any, uniforms: Any) -> Any:
+        return self.table[jnp.floor((observation[:, 0] + 1) * 2.499).astype(int)]
+
+
 @jax.tree_util.register_static
 @dataclass(frozen=True)
 class Misshaped(Actor):
@@ -172,6 +183,12 @@ def test_an_agent_outside_jax_is_evaluated_as_one_in_jax_and_a_policy_as_itself(
             Unregistered(),
             r"agents: mine: expected a JAX pytree \(jax.tree_util.register_static or .*, got Unreg",
         ),
+        (
+            "mine",
+            Tabular(jnp.array(2)),
+            r"agents: mine: expected one actor, each of its arrays with a first .* shapes \(\)",
+        ),
+        ("mine", Tabular(jnp.arange(5)), r"first axis of length one, got the shapes \(5,\)"),
         ("p0", Plain(), "agents: expected names other than .*, got p0"),
         ("mine", 3, "agents: mine: expected an Actor, or a method `act`, got 3"),
         ("random", Plain(), "agents: expected names other than .*, got random"),
@@ -348,7 +365,7 @@ def test_ctrl_c_is_not_held_until_the_last_episode(is_on_host: bool, in_the_fore
     [
         (Always(-1), "agents: mine: act: expected the index of .* from 0 to 4, got -1"),
         (Always(9), "agents: mine: act: expected the index of .* from 0 to 4, got 9"),
-        (Always(1.0), "whole number from 0 to 4, got 1.0|to act in JAX, got TypeCheckError"),
+        (Always(1.0), "agents: mine: expected it to act in JAX, got TypeError: act: expected a whole number for each"),
         (Misshaped(), "agents: mine: expected it to act in JAX, got"),
     ],
 )
@@ -357,4 +374,5 @@ def test_on_a_robot_outside_jax_an_agent_in_jax_is_tried_too(agent: Actor, messa
     policy = slider_of(timeline)
     with pytest.raises(InvalidArgument, match=message):
         evaluate({"p0": policy}, timeline, episodes=2, controls=[], agents={"mine": agent})
-    evaluate({"p0": policy}, timeline, episodes=2, controls=[], agents={"mine": Always(0)})
+    # It is only asked for what the robot observes.
+    evaluate({"p0": policy}, timeline, episodes=2, controls=[], agents={"mine": Tabular(jnp.arange(5)[None])})

@@ -185,6 +185,8 @@ def test_a_timeline_answers_with_the_newest_recording() -> None:
     for before in (-0.1, np.nan):
         with pytest.raises(InvalidArgument, match=r"at_min: expected .* started at 0 min"):
             timeline.requested_row(before)
+    with pytest.raises(InvalidArgument, match="which: expected moving or first, got 'frist'"):
+        timeline.with_percentiles("frist")
 
 
 def test_a_timeline_lasts_one_usual_interval_longer_than_its_recordings() -> None:

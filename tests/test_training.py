@@ -21,6 +21,7 @@ import pytest
 from animat.coding.mapping import Thresholds
 from animat.errors import InvalidArgument, InvalidFile, Mismatch
 from animat.execution.training import train
+from animat.folders import first_difference
 from animat.neurons.timeline import SimulatorTimeline, fit_timeline
 from animat.progress import Progress, Silent
 from animat.robots import Cartpole, Navigation
@@ -507,8 +508,9 @@ def test_what_conditions_deliver_decides_the_fingerprint() -> None:
     timeline = timeline_of()
     conditions = tuple(replace(each, electrodes=((7 + i,),)) for i, each in enumerate(timeline.conditions))
     others = replace(timeline, conditions=conditions)
-    first, second = (describe(SHORT, each)["fingerprint"] for each in (timeline, others))
-    assert first != second and describe(SHORT, replace(timeline))["fingerprint"] == first
+    first, second = (describe(SHORT, each) for each in (timeline, others))
+    assert first["fingerprint"] != second["fingerprint"] == describe(SHORT, replace(others))["fingerprint"]
+    assert "electrodes" in str(first_difference(first, second, ignoring=("fingerprint",)))
 
 
 @pytest.mark.parametrize("first_min", [33.1, 0.7, 1234.567])

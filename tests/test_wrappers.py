@@ -259,3 +259,11 @@ def test_a_file_that_is_wrong_about_what_its_policy_sees_is_refused(seeing: Poli
         (tmp_path / "other.safetensors").write_bytes(whole.replace(field, field.replace(b"true", other), 1))
         with pytest.raises(InvalidFile, match=r"this policy cannot be loaded: (weights|neural)"):
             Policy.load(tmp_path / "other.safetensors")
+
+
+@pytest.mark.parametrize("n_conditions", [2, 5])
+def test_an_animat_has_as_many_conditions_as_its_simulator(n_conditions: int) -> None:
+    animat = Animat(Cartpole(), Thresholds(9), n_conditions)
+    simulator, state = timeline_of().at(0.0), animat.reset(jax.random.key(0))
+    with pytest.raises(InvalidArgument, match=f"n_conditions: expected 3, those of the simulator, got {n_conditions}"):
+        animat.step(jax.random.key(1), state, jnp.int32(0), simulator)

@@ -177,7 +177,7 @@ class Animat(Environment[RobotState]):
             raise InvalidArgument("simulator: expected a neuron simulator, which an Animat needs, got None")
         if simulator.n_conditions != self.n_conditions:
             expected = f"expected {simulator.n_conditions}, those of the simulator, got {self.n_conditions}"
-            raise InvalidArgument(f"n_conditions: {expected}")
+            raise InvalidArgument(f"n_conditions: {expected}: make the Animat with n_conditions of the simulator")
         expect_fit(self.robot.name, self.robot.n_commands, simulator.n_readouts)
         answer = simulator.answer(action, uniforms[self.robot.noise_size], state.neurons)
         command = decode(self.mapping, answer.rate_hz, simulator.percentiles)

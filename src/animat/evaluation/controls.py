@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -12,6 +13,7 @@ from jaxtyping import Float64
 
 from animat import wrappers
 from animat.environment import Animat, Environment, Neurons
+from animat.errors import within
 from animat.evaluation.commands import mean_commands
 from animat.evaluation.coupling import best_coupling
 from animat.evaluation.rollouts import Actor, Constant, Episodes, Networks, Uniform, heuristic_policy, roll_out
@@ -20,6 +22,7 @@ from animat.neurons.simulator import NeuronSimulator, indifferent, silenced
 from animat.robots.host import HostRobot
 from animat.robots.starts import Starts
 
+OWN = "your own agent"
 Delivered = Literal["chosen", "shuffled", "silent", "yoked"]
 """What neurons are given; in training (`animat.wrappers.Delivery`) only the first two exist."""
 
@@ -81,7 +84,8 @@ class Control:
     ) -> Episodes:
         """Its episodes in the policies' environment and simulator, changed for it; errors as in `roll_out`."""
         changed = self.within(environment, simulator)
-        ran = roll_out(*changed, self.actor, episodes=episodes, seed=seed, starts=starts)
+        with within(f"agents: {self.name}") if self.meaning == OWN else nullcontext():
+            ran = roll_out(*changed, self.actor, episodes=episodes, seed=seed, starts=starts)
         self.actor.expect_no_failure()
         return ran
 

@@ -13,6 +13,7 @@ from jaxtyping import Array, Float, Key, PRNGKeyArray
 
 from animat.compilation import COMPILER_OPTIONS
 from animat.environment import Environment, Neurons, State
+from animat.errors import InvalidArgument
 from animat.robots.host import Bodies, HostRobot, StepResult
 from animat.robots.starts import Starts
 
@@ -108,9 +109,13 @@ def _count_wave(
     bodies.begin()
     n = counts.returns.shape[1]
     going = np.ones(counts.returns.shape, bool)
+    n_conditions = counts.presented.shape[1]
     of_actor, commanded = np.indices(counts.returns.shape)[0], np.zeros_like(counts.commanded)
     for command, delivered, stepped in _iterations(environment, simulator, actors, keys, bodies):
         of_bodies = stepped.reward, stepped.terminated, stepped.ended
+        if (wrong := delivered[(delivered < 0) | (delivered >= n_conditions)]).size and n_conditions:
+            expected = f"the index of a condition, a whole number from 0 to {n_conditions - 1}"
+            raise InvalidArgument(f"act: expected {expected}, got {wrong[0]}")
         reward, terminated, ended = (each.reshape(len(keys), -1)[:, :n] for each in of_bodies)
         counts.returns[:] += np.where(going, reward, 0.0)
         counts.lengths[:] += going

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from animat.environment import Environment, Neurons
 from animat.errors import InvalidArgument, first_line, shown, some_of, within
-from animat.evaluation.controls import Control
+from animat.evaluation.controls import OWN, Control
 from animat.evaluation.rollouts import Actor, Seen, Uniforms, trace
 from animat.registry import imported
 from animat.responses.condition import Condition
@@ -169,26 +169,25 @@ def controls_of_own(
             raise InvalidArgument(f"agents: {name}: expected one that sees the robot only, got {got}")
         else:
             actor = Called(name, agent)
-        controls.append(Control(name, "your own agent", actor))
+        controls.append(Control(name, OWN, actor))
     return controls
 
 
 def _try(name: str, actor: Actor, environment: Environment[Any], simulator: Neurons) -> None:
     """Raise InvalidArgument for an actor that raises, or whose actions, which JAX would not refuse, are none."""
-    try:
-        n_actors = actor.n_actors
-    except TypeError:
+    parts = [np.shape(part) for part in jax.tree.leaves(actor)]
+    if jax.tree.leaves(actor) == [actor]:
         expected = "expected a JAX pytree (jax.tree_util.register_static or register_dataclass)"
-        raise InvalidArgument(f"agents: {name}: {expected}, got {shown(actor)}") from None
-    if n_actors != 1:
-        got = f"{n_actors} side by side: give each of its arrays a first axis of length one"
-        raise InvalidArgument(f"agents: {name}: expected one actor, got {got}")
+        raise InvalidArgument(f"agents: {name}: {expected}, got {shown(actor)}")
+    if any(shape[:1] != (1,) for shape in parts):
+        expected = "expected one actor, each of its arrays with a first axis of length one"
+        raise InvalidArgument(f"agents: {name}: {expected}, got the shapes {', '.join(map(str, parts))}")
     try:
         if isinstance(environment.robot, HostRobot):
-            actions = _tried_apart(actor, environment)
-        else:
-            actions = trace(environment, simulator, actor, episodes=8, seed=1).actions
-        found = np.unique(actions).tolist()
+            # Its indices are checked in its episodes, step by step.
+            _expect_integers(actor, environment)
+            return
+        found = np.unique(trace(environment, simulator, actor, episodes=8, seed=1).actions).tolist()
     except Exception as error:
         raise InvalidArgument(f"agents: {name}: expected it to act in JAX, got {first_line(error)}") from error
     for action in found:
@@ -196,16 +195,13 @@ def _try(name: str, actor: Actor, environment: Environment[Any], simulator: Neur
             _expect_condition(action, environment.n_actions or 0)
 
 
-def _tried_apart(actor: Actor, environment: Environment[Any]) -> np.ndarray:
-    """What an actor chooses for random observations, without a robot, which outside JAX may take seconds."""
-    observation, uniforms = jax.random.split(jax.random.key(1))
-    seen = 0.5 * jax.random.normal(observation, (1_000, len(environment.observation_spec)))
-    drawn = jax.random.uniform(uniforms, (len(seen), environment.n_drawn))
+def _expect_integers(actor: Actor, environment: Environment[Any], episodes: int = 7) -> None:
+    seen = jax.ShapeDtypeStruct((episodes, len(environment.observation_spec)), jnp.float32)
+    drawn = jax.ShapeDtypeStruct((episodes, environment.n_drawn), jnp.float32)
     alone = jax.tree.map(lambda part: part[0], actor)
-    chosen = np.asarray(jax.jit(lambda: alone.act(environment, seen, drawn))())
-    if chosen.shape != (len(seen),):
-        raise ValueError(f"act: expected the shape (episodes,), got {chosen.shape} for {len(seen):,} episodes")
-    return chosen
+    chosen = jax.eval_shape(lambda *given: jnp.asarray(alone.act(environment, *given)), seen, drawn)
+    if chosen.shape != (episodes,) or not jnp.issubdtype(chosen.dtype, jnp.integer):
+        raise TypeError(f"act: expected a whole number for each of {episodes} observations, got {chosen}")
 
 
 def _expect_condition(chosen: Any, n: int) -> int:

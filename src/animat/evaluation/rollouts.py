@@ -48,10 +48,10 @@ class Actor(abc.ABC):
 
     # Only actors that call something outside JAX can fail, remember, or take long.
     def begin(self) -> None:  # noqa: B027
-        """Forget all episodes, as others begin."""
+        """Forget the episodes so far, as new ones begin."""
 
     def apart(self, run: Callable[[], T]) -> T:
-        """Run episodes in JAX such that Ctrl-C ends them soon."""
+        """Run episodes in JAX such that Ctrl-C ends them soon; in another thread, without settings of this one."""
         return run()
 
     def expect_no_failure(self) -> None:  # noqa: B027

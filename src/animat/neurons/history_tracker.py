@@ -52,7 +52,8 @@ class HistoryTracker:
     def when(self, before: HistoryState, at_s: float, *, is_rested: bool) -> HistoryState:
         """The state at a trial that is read after the pulse at `at_s`.
 
-        `before` is the state after the previous trial, `is_rested` whether no pulse came in the second before this one.
+        `before` is the state after the previous trial, `is_rested` whether the time before this one was silence
+        (`animat.responses.extraction.SILENCE_S`).
         """
         load_s = self.memory.load_s
         load = before.load * np.exp((before.at_s - at_s) / load_s) if load_s else before.load

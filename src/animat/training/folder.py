@@ -17,7 +17,7 @@ from animat.coding.mapping import REGISTRY as MAPPINGS
 from animat.errors import InvalidArgument, Mismatch
 from animat.folders import expect_no_other, first_difference, folder_mismatch, read_description, with_fingerprint
 from animat.goals.robot import without_goal
-from animat.neurons.timeline import SimulatorTimeline
+from animat.neurons.timeline import SIMULATORS, SimulatorTimeline
 from animat.plain_file import expect_no_file
 from animat.robots.base import Robot
 from animat.robots.checking import check_robot
@@ -83,10 +83,7 @@ def describe(
         "versions": versions_of(("animat", "jax", "jaxlib", "numpy", "optax"), [training.robot], device),
     }
     leaves = jax.tree.leaves(timeline.simulators if timeline else ())
-    # What conditions deliver, too: policies contain it, and may pay for it.
-    delivered = json.dumps([asdict(condition) for condition in timeline.conditions] if timeline else [])
-    contents = (np.ascontiguousarray(leaf).tobytes() for leaf in leaves)
-    manifest = with_fingerprint(decisive, delivered.encode(), *contents)
+    manifest = with_fingerprint(decisive, *(np.ascontiguousarray(leaf).tobytes() for leaf in leaves))
     culture = {} if timeline is None or timeline.culture is None else {"culture": asdict(timeline.culture)}
     # File names do not count: the same recordings in another place are the same.
     informative = {"sources": list(sources), **({} if random_return is None else {"random_return": random_return})}
@@ -101,13 +98,15 @@ def versions_of(names: Iterable[str], robots: Iterable[Robot[Any]] = (), device:
             versions |= robot.versions
     if device is not None:
         versions["device"] = device
-    return versions | {"learner": f"revision {LEARNER}"}
+    return versions | {"learner": f"revision {LEARNER}", "simulators": f"revision {SIMULATORS}"}
 
 
 def _describe_simulators(timeline: SimulatorTimeline) -> dict[str, Any]:
     return {
         **timeline.fitted,
         "conditions": [condition.label for condition in timeline.conditions],
+        # Policies contain what conditions deliver, and may pay for it.
+        "electrodes": [condition.electrodes for condition in timeline.conditions],
         "window_ms": timeline.window_ms,
         "presentation": None if timeline.presentation is None else str(timeline.presentation),
         "recorded_at_min": timeline.start_min.tolist(),
