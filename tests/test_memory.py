@@ -951,8 +951,8 @@ def test_trials_after_silence_are_answered_with_all_responses_to_such() -> None:
 def test_without_memory_policies_see_in_training_what_they_see_in_a_loop() -> None:
     rng = np.random.default_rng(2)
     responses = responses_of(rng.normal(50, 5, 200), rng.normal(60, 5, 200))
-    simulator = fit_memory(responses)
-    assert simulator.memory == NO_MEMORY
+    simulator = fit_timeline([responses], kind="memory").at(0.0)
+    assert isinstance(simulator, MemorySimulator) and simulator.memory == NO_MEMORY
     history = simulator.answer(jnp.int32(1), jnp.float32(0.9), after(0.5)).history
     assert (
         tuple(history.tolist())

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Float64, Int, Int64
 
 from animat.arguments import checked_arguments
-from animat.neurons.history import INITIAL_HISTORY, NO_MEMORY, Memory, Ranked, trace_increment
+from animat.neurons.history import NO_MEMORY, Memory, Ranked, trace_increment
 from animat.neurons.simulator import Answer, EmpiricalSimulator, Index, Rates, Scalar, Stored, fit_empirical, to_jax
 from animat.responses.responses import Responses
 from animat.tables import briefly
@@ -153,9 +153,6 @@ def fit_memory(responses: Responses, *, room: int | None = None, memory: Memory 
         histories[condition, : len(rows)] = state[in_order]
         after[condition, : len(rows)] = responses.read_hz[in_order]
         left[condition, : len(rows)] = trace_increment(ranked.rank[in_order], ranked.means[condition], memory)
-    if memory == NO_MEMORY:
-        # What policies see of it in a loop (`HistoryTracker.observed`).
-        left[:] = INITIAL_HISTORY[0]
     followers = np.array([len(rows) for rows in ranked.rows])
     return MemorySimulator(
         values.values_hz,

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float64
 from safetensors import SafetensorError, safe_open
@@ -17,7 +18,7 @@ from safetensors.numpy import save
 from animat.arguments import checked_arguments
 from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch, in_min, shown
 from animat.neurons.fidelity import Fidelity, fidelity
-from animat.neurons.history import Memory
+from animat.neurons.history import INITIAL_HISTORY, NO_MEMORY, Memory
 from animat.neurons.memory import MemorySimulator, fit_memory
 from animat.neurons.simulator import (
     EmpiricalSimulator,
@@ -274,5 +275,8 @@ def fit_simulator(
     if kind == "empirical":
         return fit_empirical(responses, room=room)
     if kind == "memory":
-        return fit_memory(responses, room=room, memory=memory)
+        fitted = fit_memory(responses, room=room, memory=memory)
+        # Without a memory the trace stays as it begins, which is what policies see in a loop (`HistoryTracker`).
+        still = jnp.full_like(fitted.left, INITIAL_HISTORY[0])
+        return replace(fitted, left=still) if fitted.memory == NO_MEMORY else fitted
     raise InvalidArgument(f"kind: expected one of {', '.join(get_args(Kind))}, got {kind!r}")
