@@ -265,6 +265,24 @@ def test_evaluate_writes_over_no_file_but_an_evaluation(
 
 
 @pytest.mark.oracle
+def test_policies_of_a_training_that_is_not_finished_are_counted(
+    recordings: Path, policies: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "policies"
+    shutil.copytree(policies, folder)
+    command = ["evaluate", str(folder), "--recordings", str(recordings), "--episodes", "2"]
+    whole = len([*folder.glob("p*.safetensors")])
+    (folder / "p1.safetensors").unlink()
+    assert main(command) == 0
+    counted = f"{folder}: 1 of the {whole} policies of its training are missing; the others are used"
+    assert f"warning: {counted}" in capsys.readouterr().err
+    for file in folder.glob("*.safetensors"):
+        file.unlink()
+    assert main(command) == 1
+    again = f"animat: {folder}: {whole} of the {whole} policies of its training are missing: run animat train again"
+    assert capsys.readouterr().err.startswith(again)
+
+
 def test_evaluate_says_whose_work_it_is(recordings: Path, policies: Path, capsys: pytest.CaptureFixture[str]) -> None:
     command = ["evaluate", str(policies), "--recordings", str(recordings), "--episodes", "3"]
     assert main([*command, "--interventions", "--json"]) == 0

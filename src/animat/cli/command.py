@@ -262,11 +262,18 @@ def policies_for(robot: str | None, mapping: str | None, path: Path) -> dict[str
     from animat.registry import is_ours
     from animat.robots.checking import check_robot
     from animat.robots.registry import REGISTRY
+    from animat.training.folder import missing_policies
     from animat.training.policy import load_policies
 
     expected = None if robot is None else REGISTRY.name_of(robot)
     expected_mapping = mapping if mapping in (None, "none") else MAPPINGS.name_of(mapping)
+    missing, planned = missing_policies(path)
+    unfinished = f"{path}: {missing} of the {planned} policies of its training are missing"
+    if missing and missing == planned:
+        raise InvalidFile(f"{unfinished}: run animat train again, which continues it")
     policies = load_policies(path)
+    if missing:
+        print(f"warning: {unfinished}; the others are used (animat train continues it)", file=sys.stderr)
     for name, policy in policies.items():
         if expected not in (None, policy.robot.name):
             raise Mismatch(

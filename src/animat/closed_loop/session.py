@@ -29,6 +29,7 @@ from animat.stimulation.stimulus import Stimuli
 from animat.tables import UNKNOWN
 from animat.writing import atomic_write, clear_leftovers, exclusive_lock, expect_writable, is_locked
 
+_OR_RUNNING = ", or it is still running"
 LOG_FILE = "session.log"
 RECORDING_FILE = "session.nwb"
 TICKS_FILE = "ticks.csv"
@@ -236,7 +237,7 @@ def read_session(path: str | os.PathLike[str]) -> Session:
         raise InvalidFile(f"{path}: expected the folder of a session, got {found}")
     log = read_log(file)
     read_header(file, log.header)
-    ending = Ending("crash", "no ending was written: the program was killed, its disk was full, or it is still running")
+    ending = Ending("crash", f"no ending was written: the program was killed, or its disk was full{_OR_RUNNING}")
     # The ending is the last record.
     last = log[-1].fields if len(log) else {}
     with expect_session_log(file):
@@ -275,6 +276,8 @@ def recover_session(path: str | os.PathLike[str], progress: Progress | None = No
         # A running session holds it.
         is_locked(folder, log.fileno())
         session = read_session(path)
+        ended = session.ending.message.removesuffix(_OR_RUNNING)
+        session = replace(session, ending=replace(session.ending, message=ended))
         _expect_no_loss(session)
         clear_leftovers(session.folder, RECORDING_FILE, TICKS_FILE)
         session.write(progress)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.metadata
 import json
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ import numpy as np
 
 from animat.coding.checking import check_mapping
 from animat.coding.mapping import REGISTRY as MAPPINGS
-from animat.errors import InvalidArgument, Mismatch
+from animat.errors import InvalidArgument, InvalidFile, Mismatch
 from animat.folders import expect_no_other, first_difference, folder_mismatch, read_description, with_fingerprint
 from animat.goals.robot import without_goal
 from animat.neurons.timeline import SIMULATORS, SimulatorTimeline
@@ -121,6 +122,15 @@ def expect_folder_for(training: Training, folder: Path) -> None:
         unknown = ("simulators", *_NOT_REPORTED, "device", *["duration_min"] * as_long_as_recordings)
         if difference := first_difference(stored, describe(training, None), ignoring=unknown, first=_FIRST):
             raise folder_mismatch(folder, "training", difference)
+
+
+def missing_policies(folder: Path) -> tuple[int, int]:
+    """How many policies a training's folder lacks, and of how many; 0 of 0 where no training is described."""
+    with suppress(OSError, InvalidFile, KeyError, TypeError):
+        if (stored := read_description(folder / MANIFEST, "training")) is not None:
+            planned: int = stored["training"]["policies"]
+            return sum(not (folder / f"p{i}.safetensors").exists() for i in range(planned)), planned
+    return 0, 0
 
 
 def is_finished(training: Training, folder: Path) -> bool:
