@@ -264,7 +264,6 @@ def test_evaluate_writes_over_no_file_but_an_evaluation(
         assert (tmp_path / name).read_bytes() == content
 
 
-@pytest.mark.oracle
 def test_policies_of_a_training_that_is_not_finished_are_counted(
     recordings: Path, policies: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -283,6 +282,7 @@ def test_policies_of_a_training_that_is_not_finished_are_counted(
     assert capsys.readouterr().err.startswith(again)
 
 
+@pytest.mark.oracle
 def test_evaluate_says_whose_work_it_is(recordings: Path, policies: Path, capsys: pytest.CaptureFixture[str]) -> None:
     command = ["evaluate", str(policies), "--recordings", str(recordings), "--episodes", "3"]
     assert main([*command, "--interventions", "--json"]) == 0

@@ -14,6 +14,7 @@ from animat.stimulation.schedule import Block
 LATE_S, LATE_PART = 0.001, 0.05
 """Stimuli that come later than planned by more than this, and than this part of their interval, are counted."""
 _LEAST_UNOBSERVED_S = 0.0005
+"""Less would be reported as 0 ms."""
 LATE_SHARE, LOST_SHARE = 0.1, 0.01
 """Shares of the stimuli, and of the frames or spikes, above which there is a warning."""
 
