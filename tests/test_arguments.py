@@ -117,6 +117,7 @@ def test_a_recording_made_by_hand_names_what_is_of_the_wrong_kind(changed: Any, 
     assert str(raised.value) == message
 
 
+@pytest.mark.oracle
 def test_names_in_place_of_a_robot_and_a_mapping_are_refused() -> None:
     # In a process of its own: here the type checks of the tests come first.
     for arguments, message in (

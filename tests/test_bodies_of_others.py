@@ -181,15 +181,10 @@ class Stopping:
             raise KeyboardInterrupt
 
 
+@pytest.mark.oracle
 @pytest.mark.parametrize(
     ("name", "mapping", "iterations"),
-    [
-        ("Slider", None, 1_200),
-        *(
-            pytest.param(*each, 2_400, marks=pytest.mark.oracle)
-            for each in (("Levels", Thresholds(1)), ("Remembers", None))
-        ),
-    ],
+    [("Slider", None, 1_200), ("Levels", Thresholds(1), 2_400), ("Remembers", None, 2_400)],
 )
 def test_stopped_and_started_again_it_ends_in_the_same_bits(
     name: str, mapping: Any, iterations: int, tmp_path: Path

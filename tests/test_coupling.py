@@ -124,6 +124,7 @@ class Hover(Robot[Hovering]):
         return -0.9 * observation[:2] - 1.8 * observation[2:]
 
 
+@pytest.mark.oracle
 def test_the_search_begins_near_the_heuristic_too(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(coupling, "GENERATIONS", 3)
     environment, scale = WithoutNeurons(Hover(), None), 0.5

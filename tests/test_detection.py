@@ -210,6 +210,7 @@ def in_window(
     return (since_ms >= window_ms[0]) & (since_ms < window_ms[1])
 
 
+@pytest.mark.oracle
 def test_responses_of_a_stimulated_culture_are_found_from_2_ms_on(stimulated: tuple[Traces, RawTraces]) -> None:
     traces, source = stimulated
     found = detect_spikes(source, traces.stimulus_time_s, Detection())

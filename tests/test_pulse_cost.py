@@ -220,6 +220,7 @@ class PaidLess(Payer):
         return after, reward - 0.25, ended
 
 
+@pytest.mark.oracle
 def test_a_cost_is_learned_from_as_if_the_robot_were_paid_less() -> None:
     """Where all conditions cost the same the two are one task; in quarters nothing is rounded, and bits are equal."""
     costing = TrialCosts(Animat(Payer(episode_limit=4), Thresholds(1), 2), (0.25, 0.25))

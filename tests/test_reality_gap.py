@@ -124,7 +124,7 @@ def without_controls(tmp_path_factory: pytest.TempPathFactory, series: list[Resp
         return *run(tmp_path_factory.mktemp("run"), series, with_controls=False, report=lines.append), lines
 
 
-@pytest.mark.parametrize("greedy", [True, False])
+@pytest.mark.parametrize("greedy", [True, pytest.param(False, marks=pytest.mark.oracle)])
 def test_policies_are_greedy_or_draw_in_prediction_and_loop_alike(
     greedy: bool, tmp_path: Path, series: list[Responses], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -696,9 +696,8 @@ def test_episodes_with_the_same_start_count_together() -> None:
     assert replace(row, measured=measured, turn=np.arange(20)).gap == gaps[1]
 
 
-@pytest.mark.parametrize(
-    "robot", [Shuttle(episode_limit=5), pytest.param(Cartpole(episode_limit=5), marks=pytest.mark.oracle)]
-)
+@pytest.mark.oracle
+@pytest.mark.parametrize("robot", [Shuttle(episode_limit=5), Cartpole(episode_limit=5)])
 @pytest.mark.usefixtures("few_bootstraps")
 def test_rows_know_which_episodes_have_the_same_start(
     tmp_path: Path, series: list[Responses], robot: Robot[Any]
@@ -802,6 +801,7 @@ def test_returns_are_predicted_from_the_starts_of_the_session(tmp_path: Path, se
         np.testing.assert_array_equal(together.expected[of], row.expected)
 
 
+@pytest.mark.oracle
 @pytest.mark.usefixtures("few_bootstraps")
 def test_an_ended_session_is_compared_with_the_starts_that_it_had(tmp_path: Path, series: list[Responses]) -> None:
     policies = {"p0": policy_of(0, series, robot=Anywhere())}
@@ -853,6 +853,7 @@ def test_rounding_is_no_gap() -> None:
     assert [replace(row, measured=row.measured + by).gap_sign for by in (-1e-12, 1e-12, -0.1, 0.1)] == [0, 0, -1, 1]
 
 
+@pytest.mark.oracle
 @pytest.mark.usefixtures("few_bootstraps")
 def test_the_range_is_that_from_the_starts_of_all_rounds(tmp_path: Path, series: list[Responses]) -> None:
     """A single policy has more rounds than the random control, which is predicted from all the same."""

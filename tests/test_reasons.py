@@ -178,6 +178,7 @@ def test_where_there_is_no_reason_hardly_one_is_named() -> None:
     assert not {"presentation", "few-samples", "lateness", "bursts"} & set(named)
 
 
+@pytest.mark.oracle
 def test_what_differs_between_episodes_is_no_reason() -> None:
     """Each episode's responses are larger or smaller as a whole: that is neither a trend nor a different command."""
 

@@ -67,6 +67,7 @@ def test_independent_responses_stay_nearly_as_they_are() -> None:
     assert np.corrcoef(np.log(independent.rate_hz), np.log(left.rate_hz))[0, 1] > 0.97
 
 
+@pytest.mark.oracle
 def test_each_response_is_at_the_rank_that_it_has_for_the_thresholds_before_it() -> None:
     """Computed again with SciPy's ranks, and with trace and load as a recording has them."""
     with FakeCulture() as culture:

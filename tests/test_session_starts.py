@@ -124,6 +124,7 @@ class Placed(Robot[ShuttleState]):
         return Shuttle().value_grid()
 
 
+@pytest.mark.oracle
 def test_the_optimal_return_is_that_of_the_sessions_starts() -> None:
     """The mean of what robots return that always start at one of them."""
 

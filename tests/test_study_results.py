@@ -232,7 +232,8 @@ def test_one_policy_on_a_robot_without_bounds_has_no_interval_and_its_results_ar
 # --- who answers ----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("delivery", [pytest.param("chosen", marks=pytest.mark.oracle), "shuffled"])
+@pytest.mark.oracle
+@pytest.mark.parametrize("delivery", ["chosen", "shuffled"])
 def test_policies_are_evaluated_as_they_are_trained_on_the_minute_s_own_neurons(tmp_path: Path, delivery: Any) -> None:
     arm = Arm("control", delivery=delivery, trained=False)
     study = Study(
