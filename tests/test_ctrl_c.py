@@ -161,7 +161,19 @@ def test_a_polite_kill_of_any_command_is_an_interrupt(tmp_path, monkeypatch, cap
     (tmp_path / "recordings" / "recording_0_min.nwb").touch()
     assert animat(["record", "--out", str(tmp_path / "recordings")]) == 130
     assert capsys.readouterr().err.endswith("animat: interrupted; finished work is kept; run it again to resume\n")
+    (tmp_path / "recordings" / "recording_0_min.nwb").rename(tmp_path / "recordings" / "recording_0000_min.nwb")
+    assert animat(["record", "--culture", "maxone", "--selection", "s", "--out", str(tmp_path / "recordings")]) == 130
+    assert "clock of a MaxOne starts with each program: begin another series in an" in capsys.readouterr().err
     assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_ctrl_c_while_the_command_line_is_read_is_one_line(monkeypatch, capsys) -> None:
+    def interrupted(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("animat.cli._parse", interrupted)
+    assert animat(["robots"]) == 130
+    assert capsys.readouterr().err == "animat: interrupted\n"
 
 
 def test_an_interrupted_session_is_reported_as_not_resumable(tmp_path, monkeypatch, capsys) -> None:

@@ -31,6 +31,7 @@ from animat.stimulation.selection import Selection, SelectionRule
 from animat.stimulation.stimulus import Stimulus
 from cultures import FEW, small_culture
 from fake_culture import FakeCulture
+from test_tissue import interrupted_after
 
 SHORT = Protocol((10.0, 40.0), patterns=5, trials=5, setup_s=0.5, pause_s=0.2)
 
@@ -458,3 +459,21 @@ def test_a_rest_that_is_broken_off_was_as_long_as_the_tissue_has_rested(monkeypa
         seen = culture.deliver([], 1.0)
         assert len(seen.spikes.time_s) > 0
         assert seen.spikes.time_s.min() >= 0
+
+
+def test_a_delivery_that_is_broken_off_ends_where_the_tissue_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with small_culture() as culture:
+        stimuli = [stimulus(culture, 0.5 * number) for number in range(40)]
+        with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+            interrupted_after(1, patch)
+            culture.deliver(stimuli, 20.0)
+        # The warm-up took 5 s of the tissue's first mark.
+        assert culture.now_s == 5.0 and culture.delivered == 40
+        # Pulses that did not come count as if they had come just now.
+        culture.rest(1.0)
+        seen = culture.deliver(stimuli[:1], 1.0)
+        assert seen.start_s == 6.0 and seen.spikes.time_s.min() >= 0 and seen.spikes.time_s.max() < 1.0
+        culture.save_state(tmp_path / "culture.state")
+    small_culture().restore_state(tmp_path / "culture.state")

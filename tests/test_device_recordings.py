@@ -20,6 +20,7 @@ from animat.cultures.safety import Admitted
 from animat.cultures.series import record_series
 from animat.cultures.shortfalls import shortfalls
 from animat.cultures.under_way import UNDER_WAY, PartialRecording
+from animat.cultures.virtual import VirtualCulture
 from animat.errors import DeviceFailed, InvalidFile
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.reading import read_recording, read_recordings
@@ -317,3 +318,28 @@ def test_less_than_half_a_millisecond_between_stretches_is_not_reported(
     observed = Observed(0.0, block.duration_s, Spikes(np.empty(0), np.empty(0, np.int64)), block.stimuli.time_s)
     found = shortfalls([(block, observed)], {}, unobserved_s, 20_000.0)
     assert [finding.message.partition("lacks: ")[2] for finding in found] == expected
+
+
+def test_a_second_ctrl_c_or_a_kill_loses_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """While what was recorded is being kept, or while the recording itself is written: the next run keeps it."""
+    protocol = Protocol(**vars(MIXED) | {"pulse": BALANCED_PULSE, "trials": 20})
+    killed, whole = tmp_path / "killed", tmp_path / "whole"
+    (made,) = record_series(lambda: on_maxone(monkeypatch)[0], protocol, whole, sessions=1).files
+
+    def kill(recording: Recording, file: Path) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("animat.cultures.series.write_nwb", kill)
+        patch.setattr("animat.cultures.under_way.write_nwb", kill)
+        with pytest.raises(KeyboardInterrupt):
+            record_series(lambda: on_maxone(monkeypatch)[0], protocol, killed, sessions=1)
+    assert [file.name for file in killed.iterdir()] == [UNDER_WAY]
+    # Whatever is recorded there next.
+    record_series(lambda: VirtualCulture(1, scan_s=0.5), Protocol(trials=1), killed, sessions=1)
+    assert not (killed / UNDER_WAY).exists()
+    kept, recording = read_recording(killed / "interrupted" / made.name), read_recording(made)
+    for name in ("protocol", "culture", "loop_pulse", "presentation", "duration_s", "findings"):
+        assert getattr(kept, name) == getattr(recording, name)
+    assert kept.provenance.keys() == recording.provenance.keys() and kept.recorded_at is not None
+    assert kept.spike_times_s.tolist() == recording.spike_times_s.tolist()

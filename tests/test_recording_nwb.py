@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 
 import h5py
@@ -16,6 +17,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
 from animat.errors import InvalidArgument, InvalidFile
+from animat.recordings.findings import Finding
 from animat.recordings.formats.hdf5_formats import read_hdf5
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.formats.nwb_spikes import write_spikes
@@ -344,3 +346,14 @@ def test_spikes_in_any_order_and_in_any_blocks_are_written_in_ascending_order(
         dataset = file.create_dataset("times", len(spikes), np.float64)
         write_spikes(dataset, arrays, counts)
         assert dataset[:].tolist() == [t for c in range(3) for t in sorted(t for t, of in spikes if of == c)]
+
+
+def test_a_date_and_findings_alike_are_kept(tmp_path: Path) -> None:
+    lost = Finding("left-out", "note", "3 keys", 3.0), Finding("left-out", "note", "4 rows", 4.0)
+    recording = replace(synthetic_recording(1, patterns=3, channels=4), findings=(*lost, replace(lost[0], value=None)))
+    dated = replace(recording, recorded_at=datetime(2024, 5, 31, 14, tzinfo=UTC))
+    write_nwb(dated, tmp_path / "dated.nwb")
+    read = read_recording(tmp_path / "dated.nwb")
+    assert read.recorded_at == dated.recorded_at and read.findings == dated.findings
+    with pytest.raises(InvalidArgument, match=r"recorded_at: expected 2024-05-31 .* by the provenance, got 2025"):
+        write_nwb(replace(read, recorded_at=datetime(2025, 1, 1, tzinfo=UTC)), tmp_path / "other.nwb")

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import itertools
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from animat.cultures.tissue import Pulse, ShortTerm, Spikes, Tissue, TissueParameters
+from animat.cultures.tissue import Pulse, ShortTerm, Spikes, Tissue, TissueParameters, kernel
 from animat.cultures.tissue.coupling import Kicks
 from animat.cultures.tissue.kernel import AXONAL_KICK_MV
 from animat.cultures.tissue.network import _communities, grow
@@ -598,3 +600,41 @@ def test_the_example_of_the_docs_runs() -> None:
     assert isinstance(evoked, Spikes)
     assert tissue.now_s == 61.0125
     assert evoked.time_s.size > 20
+
+
+def interrupted_after(n: int, patch: pytest.MonkeyPatch) -> None:
+    """Let Ctrl-C come as the n-th call of the kernel returns."""
+    advance, calls = kernel.advance, itertools.count(1)
+
+    def pressed(*given: Any) -> int:
+        written = advance(*given)
+        if next(calls) == n:
+            raise KeyboardInterrupt
+        return written
+
+    patch.setattr(kernel, "advance", pressed)
+
+
+@pytest.mark.parametrize("n", [1, 3])
+def test_interrupted_it_goes_on_from_where_it_is(n: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    undisturbed, tissue = Tissue(7, SMALL), Tissue(7, SMALL)
+    for each in (undisturbed, tissue):
+        each.advance(0.99999, pulses_over_a_second()[:-1])
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        interrupted_after(n, patch)
+        tissue.rest(60.0)
+    assert tissue.now_s == 10 * n
+    undisturbed.advance(10 * n - undisturbed.now_s)
+    # Neither the state nor what earlier pulses have on its way is lost.
+    assert_same_spikes(tissue.advance(12.0), undisturbed.advance(12.0))
+    tissue.restore(tissue.snapshot())
+
+
+def test_pulses_that_an_interrupted_delivery_has_not_come_to_are_not_delivered(monkeypatch: pytest.MonkeyPatch) -> None:
+    tissue = Tissue(7, SILENT)
+    many = [Pulse(each, np.full(3, 700.0), np.full(3, 500.0), 2.0) for each in (5.0, 15.0)]
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        interrupted_after(1, patch)
+        tissue.advance(20.0, many)
+    assert len(tissue.advance(10.0).time_s) == 0
+    assert len(tissue.advance(1.0, [dataclasses.replace(many[0], time_s=20.0)]).time_s) > 0

@@ -90,6 +90,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         finally:
             # Here, where errors can be caught, not while Python exits: help ends with SystemExit.
             sys.stdout.flush()
+    except KeyboardInterrupt:
+        # Before the command began.
+        print("animat: interrupted", file=sys.stderr)
+        return 130
     except OSError as error:
         is_closed = isinstance(error, BrokenPipeError)
         # Errors of files have a file name, and those of connections their own types.
@@ -153,10 +157,17 @@ def _message(command: Command, error: BaseException) -> str | None:
     return f"{message}: {remedy}" if (message := out_of_memory(error)) else None
 
 
+_BEGIN_ANEW = {"maxone": "MaxOne", "replay": "replay"}
+"""The cultures whose clock starts with each program."""
+
+
 def _what_is_left(command: Command) -> str:
     """What an interrupted command has kept, and how to go on."""
     if not isinstance(command, FolderCommand) or not is_folder(command.out) or not any(command.out.iterdir()):
         return ""
+    if isinstance(command, Record) and command.culture in _BEGIN_ANEW and any(command.out.glob("*.nwb")):
+        clock = f"the clock of a {_BEGIN_ANEW[command.culture]} starts with each program"
+        return f"; finished work is kept; {clock}: begin another series in another folder"
     if not isinstance(command, Run | Live):
         return "; finished work is kept; run it again to resume"
     what, session = ("session", command.out) if isinstance(command, Run) else ("live run", command.out / "session")

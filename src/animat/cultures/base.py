@@ -151,7 +151,14 @@ class Culture(Openable):
                 if stimuli and not pulses:
                     guard.expect_not_stopped()
                 admitted = guard.admit(pulses, now_s)
-                return with_rests(self._deliver(admitted, duration_s), stimuli, now_s)
+                try:
+                    observed = self._deliver(admitted, duration_s)
+                except BaseException:
+                    if self.device is None:
+                        # What was to come does not come.
+                        guard.interrupt(self.now_s)
+                    raise
+                return with_rests(observed, stimuli, now_s)
         except AnimatError as error:
             error.is_admitted = admitted is not None and len(admitted.stimuli) > 0
             raise

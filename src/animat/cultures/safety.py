@@ -180,6 +180,10 @@ class Guard:
             else:
                 return from_s + waited_s
 
+    def interrupt(self, now_s: float) -> None:
+        """Note that a delivery has ended at `now_s`: what it had not delivered counts as delivered just now."""
+        self._history.resume(round(now_s * NS))
+
     def expect_not_stopped(self) -> None:
         """Raise UnsafeStimulus after an emergency stop."""
         if self.stopped is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -14,7 +15,9 @@ import numpy as np
 
 from animat.errors import AnimatError, InvalidFile, counted
 from animat.recordings.columns import columns_of
+from animat.recordings.formats.npz import METADATA
 from animat.recordings.formats.nwb import recording_name, write_nwb
+from animat.recordings.metadata import to_metadata
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
 from animat.writing import atomic_write, clear_away, clear_leftovers
@@ -25,13 +28,16 @@ EVERY_S = 3.0
 """Shortest time between two writes."""
 INTERRUPTED = "interrupted"
 """The folder, in that of the series, for recordings of devices that were cut short."""
+_REPEATABLE = ("virtual", "replay")
+"""The kinds of culture whose recordings need not be kept, as they can be made again."""
 
 
 class PartialRecording:
     """A `follow` function for `Culture.record`; a context manager that removes the file at the end.
 
     What there is of a recording of a device, which cannot be repeated, when an error or Ctrl-C ends it before it is
-    `written`, goes into the folder `interrupted`, or else into a temporary one; after a kill, when the next run begins.
+    `written`, goes into the folder `interrupted`, or else into a temporary one; after a kill, when the next run begins,
+    whatever that one records. Until it is there, the file stays.
 
     Args:
         folder: of the series.
@@ -44,12 +50,12 @@ class PartialRecording:
         self._so_far: Callable[[], Recording] | None = None
 
     def __enter__(self) -> Self:
-        if self._is_kept and self._path.exists():
+        if self._path.exists():
             # That of a run that was killed.
             left = None
             with suppress(AnimatError):
                 left = read_recording(self._path)
-            if left is not None:
+            if left is not None and (left.culture is None or left.culture.kind not in _REPEATABLE):
                 _keep(left, self._path.parent / INTERRUPTED)
         self.remove()
         return self
@@ -57,34 +63,48 @@ class PartialRecording:
     def __call__(self, so_far: Callable[[], Recording]) -> None:
         """Write the recording so far, unless it was written less than `EVERY_S` ago."""
         self._so_far = so_far
-        if time.monotonic() - self._written_s < EVERY_S:
-            return
-        # A failed write must not end the recording, which reports its own errors.
-        with suppress(Exception), atomic_write(self._path) as temporary, temporary.open("wb") as file:
-            np.savez(file, **columns_of(so_far()))
-        self._written_s = time.monotonic()
+        if time.monotonic() - self._written_s >= EVERY_S:
+            self._write()
 
     def __exit__(self, _: object, error: BaseException | None, *rest: object) -> None:
-        self.remove()
         if error is None or self._so_far is None or not self._is_kept:
+            self.remove()
             return
-        with suppress(Exception):
-            error.add_note(_keep(self._so_far(), self._path.parent / INTERRUPTED))
-            return
-        # A full disk may be why.
-        with suppress(Exception):
-            error.add_note(_keep(self._so_far(), Path(mkdtemp(prefix="animat-"))))
-            return
+        # All of it, as this may be ended, too: by a second Ctrl-C or a kill.
+        self._write()
+        for attempt in range(3):
+            with suppress(Exception):
+                if attempt == 2:
+                    # A full disk may be why it cannot be kept.
+                    self.remove()
+                folder = Path(mkdtemp(prefix="animat-")) if attempt == 1 else self._path.parent / INTERRUPTED
+                error.add_note(_keep(self._so_far(), folder))
+                self.remove()
+                return
         error.add_note("and then: what was recorded so far could not be kept")
 
     def complete(self, recording: Recording) -> None:
-        """Note that this is all, and leave the room on the disk to it."""
+        """Note that this is all; one that can be repeated leaves its room on the disk to the recording's own file."""
         self._so_far = lambda: recording
-        self.remove()
+        if self._is_kept:
+            self._write()
+        else:
+            self.remove()
 
     def written(self) -> None:
         """Note that the recording is in its file."""
         self._so_far = None
+        self.remove()
+
+    def _write(self) -> None:
+        # A failed write must not end the recording, which reports its own errors.
+        with suppress(Exception):
+            assert self._so_far is not None
+            recording = self._so_far()
+            metadata = json.dumps(to_metadata(recording))
+            with atomic_write(self._path) as temporary, temporary.open("wb") as file:
+                np.savez(file, **{**columns_of(recording), METADATA: metadata})
+        self._written_s = time.monotonic()
 
     def remove(self) -> None:
         """Remove the file, and the remains of killed runs."""

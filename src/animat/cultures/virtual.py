@@ -260,7 +260,11 @@ class VirtualCulture(ComputedCulture):
             target_ns = tissue_ns + tissue.step_ns
         time_ns_of, neuron = self._held_ns, self._held_neuron
         if target_ns > tissue_ns:
-            fired_s, fired = tissue.advance((target_ns - tissue_ns) / NS, pulses)
+            try:
+                fired_s, fired = tissue.advance((target_ns - tissue_ns) / NS, pulses)
+            except BaseException:
+                self._end_at(end_ns)
+                raise
             fired_ns = np.rint(fired_s * NS).astype(np.int64)
             time_ns_of = np.concatenate((time_ns_of, fired_ns)) if len(time_ns_of) else fired_ns
             neuron = np.concatenate((neuron, fired)) if len(neuron) else fired
@@ -280,8 +284,11 @@ class VirtualCulture(ComputedCulture):
         try:
             tissue.rest(max(0, target_ns - round(tissue.now_s * NS)) / NS)
         finally:
-            # A rest takes long to compute: if interrupted (Ctrl-C), the clock shows how far the tissue has come.
-            self._now_ns = min(now_ns, round(tissue.now_s * NS))
+            self._end_at(now_ns)
+
+    def _end_at(self, end_ns: int) -> None:
+        """Set the clock to an end, or to how far the tissue has come if it was interrupted (Ctrl-C)."""
+        self._now_ns = min(end_ns, round(self.tissue.now_s * NS))
         held = self._held_ns >= self._now_ns
         self._held_ns, self._held_neuron = self._held_ns[held], self._held_neuron[held]
 

@@ -19,6 +19,8 @@ from animat.stimulation.pulse import Pulse
 _VALUES = "values of findings"
 """The key of the findings' values, as JSON by the keys of their messages."""
 _LOOP_PULSE = "closed_loop_pulse"
+_AGAIN = " #"
+"""Between the key of a finding and its number where several have the same severity and name."""
 
 
 def to_metadata(recording: Recording) -> dict[str, str]:
@@ -28,11 +30,19 @@ def to_metadata(recording: Recording) -> dict[str, str]:
         raise InvalidArgument(f"provenance: expected no key of a file's protocol or findings, got {reserved[0]!r}")
     if _nameless(culture := culture_of(metadata)) != _nameless(recording.culture):
         raise InvalidArgument(f"culture: expected {culture!r} by the provenance's source, got {recording.culture!r}")
+    if (recorded_at := recording.recorded_at) is not None and recorded_at != (stated := date_of(metadata)):
+        if stated is not None:
+            raise InvalidArgument(f"recorded_at: expected {stated} by the provenance, got {recorded_at}")
+        metadata["recorded_at"] = recorded_at.isoformat()
     if recording.protocol is not None:
         metadata["protocol"] = recording.protocol.to_json()
     if recording.loop_pulse is not None:
         metadata[_LOOP_PULSE] = json.dumps(recording.loop_pulse.to_list())
-    findings = {f"{finding.severity}: {finding.name}": finding for finding in recording.findings}
+    findings: dict[str, Finding] = {}
+    for finding in recording.findings:
+        key = f"{finding.severity}: {finding.name}"
+        same = sum(each.partition(_AGAIN)[0] == key for each in findings)
+        findings[f"{key}{_AGAIN}{same + 1}" if same else key] = finding
     if values := {key: finding.value for key, finding in findings.items() if finding.value is not None}:
         metadata[_VALUES] = json.dumps(values)
     return metadata | {key: finding.message for key, finding in findings.items()}
@@ -49,7 +59,7 @@ def from_metadata(metadata: Mapping[str, str]) -> dict[str, Any]:
             pulse = Pulse.from_list(json_data(text, _LOOP_PULSE))
         elif _is_finding(key):
             severity, _, name = key.partition(": ")
-            findings.append(Finding(name, severity, text, values.get(key)))  # type: ignore[arg-type]
+            findings.append(Finding(name.partition(_AGAIN)[0], severity, text, values.get(key)))  # type: ignore[arg-type]
         elif key != _VALUES:
             provenance[key] = text
     origin = {"culture": culture_of(metadata), "recorded_at": date_of(metadata)}

@@ -308,7 +308,7 @@ def advance(
     wires: tuple[np.ndarray, ...],
     values: tuple[np.ndarray, ...],
     arriving: tuple[np.ndarray, ...],
-    first_step: int,
+    clock: Int64[np.ndarray, " 2"],
     n_steps: int,
     gain: float,
     kick_step: Int64[np.ndarray, " kicks"],
@@ -316,8 +316,8 @@ def advance(
     kick_mv: Float32[np.ndarray, " kicks"],
     spike_step: Int64[np.ndarray, " capacity"],
     spike_neuron: Int64[np.ndarray, " capacity"],
-) -> tuple[int, int, int]:
-    """Advance by up to `n_steps`, and return how many steps were taken, kicks passed, and spikes written.
+) -> int:
+    """Advance by up to `n_steps`, and return how many spikes were written.
 
     It stops early when a step's spikes might no longer fit the output. Unpacking a named tuple takes a call twice as
     long as a plain one, which matters for calls of 60 steps of 2 us.
@@ -325,9 +325,10 @@ def advance(
     Args:
         record: from `prepare_constants`.
         wires, values, arriving: plain tuples of `Wiring`, `State` and `Arrivals`; the last two are changed in place.
-        first_step: the tissue's clock, in steps.
+        clock: the tissue's clock, in steps, and how many kicks have passed; changed in place, so that an exception
+            that follows, as of Ctrl-C, finds it as the state is.
         gain: factor on excitatory weights during this call.
-        kick_step, kick_neuron, kick_mv: kicks in order of their steps, none before `first_step`.
+        kick_step, kick_neuron, kick_mv: kicks in order of their steps; none that has not passed is before the clock.
         spike_step, spike_neuron: output, with room for at least one spike per neuron.
     """
     constants, wiring, state, arrivals = record[0], Wiring(*wires), State(*values), Arrivals(*arriving)
@@ -335,10 +336,11 @@ def advance(
     last_row = state.arriving_ampa.shape[0] - 1
     mean_mv = np.empty(n, np.float32)
     fill_mean(wiring, state, mean_mv)
-    kicks = spikes = 0
+    kicks, spikes, first_step = clock[1], 0, clock[0]
     for step in range(first_step, first_step + n_steps):
         if spikes + n > spike_step.size:
-            return step - first_step, kicks, spikes
+            clock[0], clock[1] = step, kicks
+            return spikes
         count_down(state.refractory)
         while kicks < kick_step.size and kick_step[kicks] == step:
             i = kick_neuron[kicks]
@@ -370,7 +372,8 @@ def advance(
                         spikes += 1
                         fire(constants, wiring, state, arrivals, i, step, gain)
         arrive(constants, state, arrivals, step & last_row)
-    return n_steps, kicks, spikes
+    clock[0], clock[1] = first_step + n_steps, kicks
+    return spikes
 
 
 @compiled

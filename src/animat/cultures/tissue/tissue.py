@@ -79,7 +79,9 @@ class Tissue:
         self._adopt(fresh_state(seed, self.parameters, self._network, self._wiring))
         self.step_ns = round(self.parameters.step_ms * 1e6)
         self._step_s = self.step_ns / NS
-        self._now_ns, self._step, self._kicks = 0, 0, NO_KICKS
+        self._now_ns, self._kicks = 0, NO_KICKS
+        # In steps, and how many of the kicks have passed.
+        self._clock = np.zeros(2, np.int64)
         # Step and neuron of each spike, as the kernel writes them.
         self._output = tuple(np.empty((2, max(4 * self.parameters.neurons, 20_000)), np.int64))
 
@@ -94,26 +96,32 @@ class Tissue:
         The clock counts nanoseconds and the model runs all steps that are complete, so a second in eighty pieces of
         12.5 ms is the same as in one. A pulse acts at the first step that does not begin before it.
 
+        Interrupted, as by Ctrl-C, it ends at the step that it has come to, and the other pulses are not delivered.
+
         Args:
             pulses: with times in [now_s, now_s + duration_s), in any order; for any other no time passes.
         """
         end_ns = self._now_ns + _nanoseconds(duration_s)
+        before = self._coming
         if pulses:
             new = [self._kicks_of(pulse, end_ns) for pulse in sorted(pulses, key=lambda pulse: pulse.time_s)]
-            self._kicks = in_order(self._kicks, *new)
-        self._now_ns = end_ns
+            self._set_kicks(in_order(before, *new))
         last_step = end_ns // self.step_ns
         parts = []
-        while self._step < last_step:
-            mark = self._step * self.step_ns // (MARK_S * NS)
-            mark_end = -(-(mark + 1) * MARK_S * NS // self.step_ns)
-            steps, gain = min(last_step, mark_end) - self._step, self._drift.gain(mark)
-            taken, passed, n = kernel.advance(*self._run, self._step, steps, gain, *self._kicks, *self._output)
-            self._step += taken
-            if passed:
-                self._kicks = Kicks(*(column[passed:] for column in self._kicks))
-            step, neuron = self._output
-            parts.append(Spikes(step[:n] * self._step_s, neuron[:n].copy()))
+        try:
+            while (done := self._step) < last_step:
+                mark = done * self.step_ns // (MARK_S * NS)
+                mark_end = -(-(mark + 1) * MARK_S * NS // self.step_ns)
+                steps, gain = min(last_step, mark_end) - done, self._drift.gain(mark)
+                n = kernel.advance(*self._run, self._clock, steps, gain, *self._kicks, *self._output)
+                step, neuron = self._output
+                parts.append(Spikes(step[:n] * self._step_s, neuron[:n].copy()))
+        except BaseException:
+            self._set_kicks(Kicks(*(column[before.step >= self._step] for column in before)))
+            self._now_ns = max(self._now_ns, self._step * self.step_ns)
+            raise
+        self._now_ns = end_ns
+        self._set_kicks(self._coming)
         # Usually one part: concatenating it with nothing would add 1 % to the cost of 12.5 ms.
         return parts[0] if len(parts) == 1 else Spikes(*map(np.concatenate, zip(NO_SPIKES, *parts, strict=True)))
 
@@ -126,7 +134,7 @@ class Tissue:
     def snapshot(self) -> Snapshot:
         """A copy of the state, for `restore`."""
         state = State(*(values.copy() for values in self._state))
-        return Snapshot(self.seed, self.parameters, self._now_ns, self._step, self._kicks, state)
+        return Snapshot(self.seed, self.parameters, self._now_ns, self._step, self._coming, state)
 
     def restore(self, snapshot: Snapshot) -> None:
         """Return to a snapshot, from which the tissue continues bit for bit; refuses a state that it cannot reach."""
@@ -134,7 +142,21 @@ class Tissue:
             raise Mismatch(f"snapshot: expected one of this tissue, with seed {self.seed}, got one of another")
         expect_sound(snapshot, self._state, self._wiring, self.step_ns)
         self._adopt(State(*(values.copy() for values in snapshot.state)))
-        self._now_ns, self._step, self._kicks = snapshot.now_ns, snapshot.step, snapshot.kicks
+        self._now_ns, self._clock[0] = snapshot.now_ns, snapshot.step
+        self._set_kicks(snapshot.kicks)
+
+    @property
+    def _step(self) -> int:
+        return int(self._clock[0])
+
+    @property
+    def _coming(self) -> Kicks:
+        """The kicks that have not passed."""
+        passed = int(self._clock[1])
+        return Kicks(*(column[passed:] for column in self._kicks)) if passed else self._kicks
+
+    def _set_kicks(self, kicks: Kicks) -> None:
+        self._kicks, self._clock[1] = kicks, 0
 
     def _adopt(self, state: State) -> None:
         self._state = state

@@ -5,7 +5,7 @@ from __future__ import annotations
 import zipfile
 import zlib
 from collections.abc import Mapping
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,9 @@ import numpy as np
 from animat.errors import InvalidFile, UnusableData, did_you_mean, first_line, some_of
 from animat.recordings.columns import REQUIRED, Column, PlainColumns
 from animat.recordings.findings import left_out_findings
+from animat.recordings.metadata import from_metadata
 from animat.recordings.recording import Recording
+from animat.records import json_data, read_record
 from animat.tables import UNKNOWN
 
 KEYS = tuple(field.name for field in fields(PlainColumns))
@@ -29,11 +31,13 @@ OTHER_NAMES = {
 SPREADSHEET = "[Content_Types].xml"
 """Present in the zip archives of spreadsheets."""
 ROUTING = ("mapping_electrode", "mapping_xy_um")
+METADATA = "animat_metadata"
+"""What else a recording in progress states, as JSON."""
 
 
 def read_npz(path: Path) -> Recording:
     """Read a recording from a numpy archive of plain columns; nothing in it is ever unpickled."""
-    columns, keys, left_out = load_columns(path, (*KEYS, *ROUTING))
+    columns, keys, left_out = load_columns(path, (*KEYS, *ROUTING, METADATA))
     if missing := [key for key in REQUIRED if key not in columns]:
         if any(key.startswith("state_") for key in keys):
             raise InvalidFile(f"{path}: expected a recording, got the state of a virtual culture")
@@ -48,12 +52,17 @@ def read_npz(path: Path) -> Recording:
     provenance = {"source": path.name, "format": "NPZ"}
     if "spike_unit" in keys:
         provenance["channels"] = "sorted units"
+    metadata = columns.pop(METADATA, None)
     routing = [columns.pop(key) for key in ROUTING if key in columns]
     if "channel_xy_um" in columns and "channel_electrode" not in columns and len(routing) == len(ROUTING):
         columns["channel_electrode"] = _electrodes_at(columns["channel_xy_um"], *routing)
         provenance["channel_electrode"] = "by position, from mapping_electrode and mapping_xy_um"
     findings = left_out_findings("keys", left_out, missing=[key for key in KEYS if key not in columns])
-    return PlainColumns(**columns).to_recording(provenance, findings)
+    recording = PlainColumns(**columns).to_recording(provenance, findings)
+    if metadata is None:
+        return recording
+    texts = read_record(dict[str, str], json_data(str(metadata), METADATA), METADATA)
+    return replace(recording, **from_metadata(texts))
 
 
 def load_columns(path: Path, known: tuple[str, ...]) -> tuple[dict[str, Any], list[str], list[str]]:
