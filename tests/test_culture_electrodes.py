@@ -408,6 +408,21 @@ def test_a_replay_answers_from_the_newest_recording_at_its_clock() -> None:
         assert replay.advance(0.01).time_s.tolist() == [0.0]
 
 
+def test_a_replay_answers_from_no_pulse_whose_response_was_not_recorded_to_its_end() -> None:
+    with FakeCulture() as fake:
+        source = fake.record(Protocol((20.0,), patterns=2, trials=4))
+    times_s = source.stimuli.time_s + 0.003
+    source = replace(source, spike_times_s=times_s[:-1], spike_channels=np.zeros(len(times_s) - 1, np.int64))
+    ended = replace(source, duration_s=source.stimuli.time_s[-1] + 0.002 - source.start_s)
+    answered = []
+    for recording in (source, ended):
+        with ReplayCulture([recording]) as replay:
+            pulses = [Stimulus(0.02 * n, replay.stimulation_electrodes[:1], PUBLISHED_PULSE, 20.0) for n in range(60)]
+            answered.append(len(replay.deliver(pulses, 1.25).spikes.time_s))
+    # The last pulse was followed by none as long as it was recorded.
+    assert answered[0] < answered[1] == 60
+
+
 def test_what_a_replay_cannot_answer_from_is_refused() -> None:
     with FakeCulture() as fake:
         source = fake.record(Protocol((20.0,), patterns=2, trials=4))

@@ -740,3 +740,12 @@ def test_a_message_names_the_column_of_the_file(columns: dict[str, Any], message
     np.savez(file, **{"spike_time_s": [0.1, 2.0], "spike_channel": [0, 0], "stimulus_time_s": [0.05], **columns})
     with pytest.raises(InvalidFile, match=re.escape(f"a.npz: {message}")):
         read_recording(file)
+
+
+def test_names_of_channels_that_look_like_numbers_stay_different(tmp_path: Path) -> None:
+    for names, labels in ((("1", "01", "1"), ["01", "1"]), (("1", "1.0", "2"), ["1", "2"])):
+        spikes = "".join(f"{0.1 * n:g},{name}\n" for n, name in enumerate(names))
+        (tmp_path / "a_spikes.csv").write_text(f"time_s,channel\n{spikes}")
+        (tmp_path / "a_stimuli.csv").write_text("time_s,frequency_hz\n0.05,10\n")
+        recording = read_recording(tmp_path / "a_spikes.csv")
+        assert sorted(map(str, recording.channels.label.tolist())) == labels

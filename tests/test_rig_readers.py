@@ -167,6 +167,13 @@ def test_what_is_in_the_text_of_some_pulses_only_is_not_guessed() -> None:
     assert columns(trials[1], trials[1]) == columns(*trials) == columns() == {}
 
 
+@pytest.mark.parametrize(("number", "trial"), [([0] * 3, [0] * 3), ([0] * 6 + [1] * 3, [0] * 3 + [1] * 3 + [2] * 3)])
+def test_trials_with_the_same_number_end_after_their_pulses(number: list[int], trial: list[int]) -> None:
+    read = stimulus_columns([json.dumps({"presentation": n, "order": "mixed", "pulses": 3}) for n in number])
+    assert read.pop("stimulus_presentation").tolist() == trial
+    assert read == {"presentation_order": "mixed", "presentation_pulses": 3}
+
+
 def test_maxwell_is_read_without_groups_or_mapping(tmp_path: Path) -> None:
     spikes = spike_table([0.5, 0.25], [9, 40])
     recording = read_recording(write_maxwell(tmp_path / "a.h5", mapping=TABLE, spikes=spikes))

@@ -23,6 +23,8 @@ from animat.tables import UNKNOWN
 NS = 1_000_000_000
 REACH_S = 1.0
 """Length of a response, unless another stimulus came sooner: longer than any response window."""
+RESPONSE_S = 0.01
+"""A pulse with less than this, the default window, before the end of its recording answers only if no other can."""
 
 
 class ReplayCulture(ComputedCulture):
@@ -143,7 +145,14 @@ class ReplayCulture(ComputedCulture):
         same = is_same(frequency_hz, stimulus.frequency_hz) | np.isnan(stimulus.frequency_hz)
         number_of, set_of_pulse = self._sets[row]
         electrodes = number_of.get(frozenset(stimulus.electrodes), UNKNOWN)
-        for narrower in (~stimuli.is_rest, stimuli.is_last_of_presentation == is_last, set_of_pulse == electrodes):
+        # A response that goes beyond the end of the recording is not known.
+        is_whole = stimuli.time_s + RESPONSE_S <= recording.stop_s
+        for narrower in (
+            ~stimuli.is_rest,
+            is_whole,
+            stimuli.is_last_of_presentation == is_last,
+            set_of_pulse == electrodes,
+        ):
             same = same & narrower if np.any(same & narrower) else same
         pool = np.flatnonzero(same)
         if not len(pool):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -141,6 +142,9 @@ def plain_column(table: TextTable, place: int, name: str) -> Column:
     try:
         numbers = as_numbers(cells)
     except ValueError:
+        return np.array(cells, dtype=np.str_)
+    if len(np.unique(numbers)) < len({re.sub(r"\.0*$", "", cell.strip()) for cell in {*cells}}):
+        # Names that look like numbers, such as 01 beside 1.
         return np.array(cells, dtype=np.str_)
     if name == "spike_channel" and np.any(wrong := numbers % 1 > 0):
         row = int(np.flatnonzero(wrong)[0])

@@ -74,21 +74,26 @@ def stimulus_columns(lines: Sequence[str]) -> dict[str, Any]:
     pattern = np.array([_whole(pulse.get("pattern")) for pulse in pulses], dtype=np.int64)
     if np.any(pattern != UNKNOWN):
         columns["stimulus_pattern"] = pattern
+    counts = {_whole(pulse.get("pulses")) for pulse in pulses}
+    n_pulses = next(iter(counts)) if len(counts) == 1 else UNKNOWN
     presentation = np.array([_whole(pulse.get("presentation")) for pulse in pulses], dtype=np.int64)
-    # Pulses that belong to no particular trial all have the same number.
-    has_presentation = bool(np.all(presentation != UNKNOWN)) and len(np.unique(presentation)) > 1
+    # Pulses that belong to no particular trial all have the same number, and do not say how many a trial has.
+    is_numbered = len(np.unique(presentation)) > 1 or n_pulses > 1
+    has_presentation = is_numbered and bool(np.all(presentation != UNKNOWN))
     if has_presentation:
-        # Numbers may restart in the middle of a file: what counts is where they change.
-        columns["stimulus_presentation"] = np.cumsum(np.diff(presentation, prepend=presentation[0]) != 0)
+        # Numbers may restart in the middle of a file: what counts is where they change, and how many are alike.
+        rows = np.arange(len(presentation))
+        begins = np.diff(presentation, prepend=presentation[0]) != 0
+        since = rows - np.maximum.accumulate(np.where(begins, rows, 0))
+        again = (since > 0) & (since % n_pulses == 0) if n_pulses > 1 else False
+        columns["stimulus_presentation"] = np.cumsum(begins | again)
     electrodes = [_electrodes(pulse.get("electrodes")) for pulse in pulses]
     if any(electrodes):
         columns["stimulus_electrodes"] = padded(electrodes)
     orders = {order if isinstance(order := pulse.get("order"), str) else None for pulse in pulses}
-    counts = {_whole(pulse.get("pulses")) for pulse in pulses}
-    if len(orders) == 1 and orders <= {"blocked", "mixed"}:
-        n_pulses = next(iter(counts)) if len(counts) == 1 else UNKNOWN
-        if n_pulses == 1 or (n_pulses > 1 and has_presentation):
-            columns |= {"presentation_order": next(iter(orders)), "presentation_pulses": n_pulses}
+    is_ordered = len(orders) == 1 and orders <= {"blocked", "mixed"}
+    if is_ordered and (n_pulses == 1 or (n_pulses > 1 and has_presentation)):
+        columns |= {"presentation_order": next(iter(orders)), "presentation_pulses": n_pulses}
     return columns
 
 
