@@ -124,6 +124,28 @@ def without_controls(tmp_path_factory: pytest.TempPathFactory, series: list[Resp
         return *run(tmp_path_factory.mktemp("run"), series, with_controls=False, report=lines.append), lines
 
 
+@pytest.mark.parametrize(("percentiles", "adaptive"), [("moving", True), ("first", False)])
+def test_recordings_before_the_policies_first_one_are_not_used(
+    percentiles: str, adaptive: bool, series: list[Responses], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("animat.reality_gap.calibration.BOOTSTRAPS", 2)
+    four = [replace(series[n % 2], start_min=10.0 * n) for n in range(4)]
+    trained = {"shadowing": True, "duration_min": 20.0, "chunks": 60, "percentiles": percentiles}
+    provenance = {"training": trained, "simulators": {"recorded_at_min": [20.0, 30.0]}}
+    policy = replace(policy_of(0, series), provenance=provenance)
+    for at_min, start_min in ((None, 30.0), (25.0, 20.0)):
+        found, alone = (Calibration.of_series(s, policy, at_min=at_min, adaptive=adaptive) for s in (four, four[2:]))
+        assert found.start_min == alone.start_min == start_min
+        assert found.percentiles.tolist() == alone.percentiles.tolist()
+        assert [each.message for each in found.findings if each.name == "older-recordings"] == [
+            "not used: 2 recordings before that at 20 min, the policies' first one"
+        ]
+    assert Calibration.of_series(four, policy, at_min=0.0).start_min == 0.0
+    # Without the policies' own first recording, its fixed thresholds are not known.
+    other = Calibration.of_series(four[3:], policy, adaptive=adaptive)
+    assert ("other-percentiles" in [each.name for each in other.findings]) == (not adaptive)
+
+
 @pytest.mark.parametrize("greedy", [True, pytest.param(False, marks=pytest.mark.oracle)])
 def test_policies_are_greedy_or_draw_in_prediction_and_loop_alike(
     greedy: bool, tmp_path: Path, series: list[Responses], monkeypatch: pytest.MonkeyPatch

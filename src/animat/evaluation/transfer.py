@@ -152,9 +152,14 @@ def timeline_differences(policy: Policy, timeline: SimulatorTimeline) -> Iterato
         yield Finding("other-window", "warning", message)
     yield from other_simulator(policy.fitted, timeline.fitted)
     yield from other_culture(policy.culture, timeline.culture)
-    first_min = next(iter(policy.recorded_at_min), None)
-    if policy.percentiles == "first" and first_min not in (None, float(timeline.start_min[0])):
-        fixed = f"{in_min(first_min)}, which is not the first of these ({in_min(timeline.start_min[0])})"
+    yield from other_percentiles(policy, float(timeline.start_min[0]))
+
+
+def other_percentiles(policy: Policy, first_min: float) -> Iterator[Finding]:
+    """Whether a policy's percentiles are those of another recording than the first of those given."""
+    own_min = next(iter(policy.recorded_at_min), None)
+    if policy.percentiles == "first" and own_min not in (None, first_min):
+        fixed = f"{in_min(own_min)}, which is not the first of these ({in_min(first_min)})"
         message = f"the policies' percentiles were fixed from the recording at {fixed}"
         yield Finding("other-percentiles", "warning", message)
 

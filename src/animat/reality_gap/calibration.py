@@ -15,7 +15,8 @@ from animat.closed_loop.adaptive import AdaptiveThresholds, kept_counts
 from animat.coding.mapping import Thresholds
 from animat.cultures.base import Culture
 from animat.cultures.kinds import pulse_for
-from animat.errors import in_min
+from animat.errors import counted, in_min
+from animat.evaluation.transfer import other_percentiles
 from animat.neurons.history import Ranked
 from animat.neurons.history_tracker import AdjustedRanks, HistoryState, HistoryTracker
 from animat.neurons.memory import MemorySimulator
@@ -123,14 +124,20 @@ class Calibration:
 
         Args:
             series: in any order.
-            policy: determines the recording, that of its last simulator in training. Fixed thresholds are those with
-                which it was trained.
+            policy: determines the recording, that of its last simulator in training; those before its first one are
+                left out. Fixed thresholds are those with which it was trained.
             at_min: the minute whose newest recording is used instead; None without a policy: the last.
             adaptive: whether the loop's thresholds will adapt, or are fixed. With adaptive thresholds, simulators are
                 made of responses as these read them (`reread`), except for recordings in blocks and for policies
                 whose mapping is not thresholds.
             kind, bins, range_hz: of the simulator, see `fit_timeline`, whose errors are raised.
         """
+        own_min = min(policy.recorded_at_min[:1], default=-np.inf) if policy is not None else -np.inf
+        own = [each for each in series if each.start_min >= own_min]
+        older, findings = len(series) - len(own), tuple[Finding, ...]()
+        if older and own and (at_min is None or at_min >= own_min):
+            what = f"not used: {counted(older, 'recording')} before that at {in_min(own_min)}, the policies' first one"
+            series, findings = own, (Finding("older-recordings", "note", what, float(older)),)
         timeline = fit_timeline(series, kind=kind, bins=bins, range_hz=range_hz)
         fit: dict[str, Any] = {"kind": timeline.fitted["kind"], "bins": bins, "range_hz": range_hz}
         if at_min is None:
@@ -164,7 +171,7 @@ class Calibration:
             start_min=start_min,
             conditions=timeline.conditions,
             presentation=timeline.presentation,
-            findings=timeline.findings_at(start_min),
+            findings=findings + timeline.findings_at(start_min),
             fitted={name: timeline.fitted[name] for name in FITTED},
             readouts=timeline.readouts,
             adjusted=adjusted,
@@ -174,6 +181,8 @@ class Calibration:
         )
         if adaptive or policy is None or policy.percentiles != "first":
             return calibration
+        found = calibration.findings + tuple(other_percentiles(policy, float(timeline.start_min[0])))
+        calibration = replace(calibration, findings=found)
         return calibration.with_percentiles(timeline.with_percentiles("first").at(start_min).percentiles)
 
     def with_percentiles(self, percentiles: Any) -> Self:

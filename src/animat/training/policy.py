@@ -182,8 +182,13 @@ class Policy:
         return self.provenance.get("training") or {}
 
     def trained_until_min(self, first_min: float) -> float | None:
-        """The minute of the culture's clock at which training ended if it began at `first_min`; None if unknown."""
+        """The minute at which training ended, on the culture's clock; None if unknown.
+
+        Args:
+            first_min: of the recordings; training did not begin before its own first one, if that is later.
+        """
         trained = self._trained
+        first_min = max([first_min, *self.recorded_at_min[:1]])
         if not trained:
             return None
         if not trained.get("shadowing") or trained.get("duration_min") is None:
