@@ -238,7 +238,7 @@ def run_context_study(
     """Run the study in a folder, or resume it there; arguments and errors as in `animat.studies.run.run_study`."""
     expect_workers(workers, executor)
     folder = Path(folder).absolute()
-    versions = versions_of(_PACKAGES) | {"virtual tissue": f"revision {REVISION}"}
+    versions = versions_of(_PACKAGES, map(robot_named, study.robots)) | {"virtual tissue": f"revision {REVISION}"}
     manifest = with_fingerprint({"context study": asdict(study), "versions": versions})
     cultures = [f"culture-{culture}" for culture in study.cultures]
     rows: list[ContextRow] = []

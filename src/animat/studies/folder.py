@@ -10,11 +10,11 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from animat.coding.mapping import mapping_named
 from animat.errors import InvalidArgument, Mismatch, as_invalid_file
 from animat.execution.receipts import sha256
 from animat.execution.task import NOTICES, UNFINISHED
 from animat.folders import first_difference, folder_mismatch, read_description, with_fingerprint
-from animat.goals.robot import without_goal
 from animat.plain_file import expect_no_file, expect_plain_file
 from animat.recordings.formats.csv import stimuli_beside
 from animat.recordings.reading import list_recordings
@@ -44,9 +44,12 @@ def describe_study(study: Study, sources: dict[str, str], device: str | None = N
 
     `device` is the kind of GPU that trains, as GPUs round differently; None for CPU cores, which are not recorded.
     """
-    robots = [without_goal(spec.robot()) for spec in study.robots]
+    things: list[Any] = [
+        *(spec.robot() for spec in study.robots),
+        *(mapping_named(arm.mapping) for arm in study.arms if arm.through_neurons),
+    ]
     # Another version may round differently, or draw other figures.
-    versions = {"python": platform.python_version(), **versions_of(_PACKAGES, robots, device)}
+    versions = {"python": platform.python_version(), **versions_of(_PACKAGES, things, device)}
     if study.culture.kind == "virtual":
         from animat.cultures.tissue.parameters import REVISION
 

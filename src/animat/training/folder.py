@@ -15,6 +15,7 @@ import numpy as np
 
 from animat.coding.checking import check_mapping
 from animat.coding.mapping import REGISTRY as MAPPINGS
+from animat.coding.mapping import Mapping as MappingOfResponses
 from animat.errors import InvalidArgument, InvalidFile, Mismatch
 from animat.folders import expect_no_other, first_difference, folder_mismatch, read_description, with_fingerprint
 from animat.goals.robot import without_goal
@@ -26,6 +27,7 @@ from animat.robots.host import HostRobot
 from animat.robots.registry import REGISTRY as ROBOTS
 from animat.training.course import ASSESSED
 from animat.training.group import BEST, Group, split_groups
+from animat.training.own_code import code_of
 from animat.training.policy import Policy
 from animat.training.settings import LEARNER
 from animat.training.specification import CHUNKS, Training
@@ -81,7 +83,9 @@ def describe(
     decisive = {
         "training": training.to_dict(),
         "simulators": None if timeline is None else _describe_simulators(timeline),
-        "versions": versions_of(("animat", "jax", "jaxlib", "numpy", "optax"), [training.robot], device),
+        "versions": versions_of(
+            ("animat", "jax", "jaxlib", "numpy", "optax"), [training.robot, training.mapping], device
+        ),
     }
     leaves = jax.tree.leaves(timeline.simulators if timeline else ())
     manifest = with_fingerprint(decisive, *(np.ascontiguousarray(leaf).tobytes() for leaf in leaves))
@@ -91,12 +95,19 @@ def describe(
     return manifest | culture | informative
 
 
-def versions_of(names: Iterable[str], robots: Iterable[Robot[Any]] = (), device: str | None = None) -> dict[str, str]:
-    """Versions of what may round or draw differently: packages by `names`, those of robots, the GPU and the learner."""
+def versions_of(
+    names: Iterable[str], things: Iterable[Robot[Any] | MappingOfResponses | None] = (), device: str | None = None
+) -> dict[str, str]:
+    """Versions of what may round or draw differently: packages by `names`, the GPU, the learner and the simulators.
+
+    Of `things`, robots and mappings, those of their own packages, and the code of the user's own.
+    """
     versions = {name: importlib.metadata.version(name) for name in names}
-    for robot in robots:
-        if isinstance(robot, HostRobot):
-            versions |= robot.versions
+    for thing in things:
+        body = without_goal(thing) if isinstance(thing, Robot) else thing
+        versions |= {} if body is None else code_of(body)
+        if isinstance(body, HostRobot):
+            versions |= body.versions
     if device is not None:
         versions["device"] = device
     return versions | {"learner": f"revision {LEARNER}", "simulators": f"revision {SIMULATORS}"}

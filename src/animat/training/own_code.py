@@ -1,0 +1,60 @@
+"""The code of a robot or a mapping of the user's own, so that work begun with other code is not continued."""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+import sys
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from animat.registry import is_ours
+
+
+def code_of(thing: Any) -> dict[str, str]:
+    """A fingerprint of the code of a robot or a mapping, by its name; empty for one of animat's own.
+
+    The code is that of its class and of everything in the class's module that it uses; comments and docstrings do not
+    count. Code in other modules does not count either, nor code that is in no file, as in a notebook.
+    """
+    kind = type(thing)
+    file = getattr(sys.modules.get(kind.__module__), "__file__", None)
+    if is_ours(thing) or file is None:
+        return {}
+    with suppress(OSError, ValueError, SyntaxError):
+        parts = _used_by(kind.__qualname__.partition(".")[0], ast.parse(Path(file).read_bytes()))
+        if parts:
+            digest = hashlib.sha256("\n".join(map(ast.unparse, parts)).encode()).hexdigest()
+            return {f"code of {thing.name}": f"sha256 {digest[:16]}"}
+    return {}
+
+
+def _used_by(name: str, module: ast.Module) -> list[ast.stmt]:
+    """The statements of a module that define a name, and all that these use, in their order."""
+    defines = [(statement, _defined_in(statement)) for statement in map(_Plain().visit, module.body)]
+    wanted, used = [name], {name}
+    while wanted:
+        current = wanted.pop()
+        for statement, names in defines:
+            if current in names:
+                new = {node.id for node in ast.walk(statement) if isinstance(node, ast.Name)} - used
+                used |= new
+                wanted += sorted(new)
+    return [statement for statement, names in defines if names & used]
+
+
+def _defined_in(statement: ast.stmt) -> set[str]:
+    if isinstance(statement, ast.Import | ast.ImportFrom):
+        return {(alias.asname or alias.name).partition(".")[0] for alias in statement.names}
+    own = {statement.name} if isinstance(statement, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef) else set()
+    if own:
+        return own
+    return {node.id for node in ast.walk(statement) if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)}
+
+
+class _Plain(ast.NodeTransformer):
+    """Removes docstrings, and other text that nothing uses."""
+
+    def visit_Expr(self, node: ast.Expr) -> ast.AST:
+        return ast.Pass() if isinstance(node.value, ast.Constant) else node
