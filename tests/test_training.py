@@ -519,3 +519,29 @@ def test_simulators_change_with_the_chunk_whatever_the_minutes(first_min: float)
     training = replace(SHORT, duration_min=60.0)
     rows = [timeline.row_at(first_min + training.minute(i)) for i in range(60)]
     assert rows == [i // 10 for i in range(60)]
+
+
+@pytest.mark.parametrize(
+    ("minutes", "unused"),
+    [
+        ([0.0], []),
+        ([0.0, 10.0, 20.0], []),
+        ([7.0, 607.0, 617.0, 627.0], [617.0]),
+        ([0.0, 10.0, 20.0, 1440.0, 1450.0, 1460.0], [10.0, 1440.0, 1450.0]),
+        ([10.0 * n for n in range(60)], []),
+        ([10.0 * n for n in range(61)], [590.0]),
+    ],
+)
+def test_the_newest_recording_is_always_used_and_those_that_are_not_are_named(
+    minutes: list[float], unused: list[float]
+) -> None:
+    timeline = replace(timeline_of(), start_min=np.array(minutes))
+    asked = replace(SHORT, duration_min=None)
+    lasting = asked.with_duration_of(timeline)
+    used = {float(timeline.start_min[timeline.row_at(minutes[0] + lasting.minute(i))]) for i in range(CHUNKS)}
+    assert minutes[-1] in used and [each for each in minutes if each not in used] == unused
+    found = asked.unused_recordings(timeline)
+    assert [each.value for each in found] == [len(unused)] * bool(unused)
+    for finding in found:
+        assert ", ".join(f"{minute:g} min" for minute in unused) in finding.message
+    assert lasting.unused_recordings(timeline) == replace(asked, shadowing=False).unused_recordings(timeline) == ()

@@ -18,6 +18,7 @@ from animat.writing import expect_writable
 
 if TYPE_CHECKING:
     from animat.neurons.timeline import SimulatorTimeline
+    from animat.recordings.findings import Finding
     from animat.responses.readouts import Readouts
     from animat.training.policy import Policy
     from animat.training.specification import Training
@@ -96,6 +97,8 @@ class Train(SimulatorOptions, JobOptions):
             print(f"warning: {caveat}", file=sys.stderr)
         timeline = None if training.mapping is None else self._timeline(readouts)
         training.environment_on(timeline)
+        unused = () if timeline is None else training.unused_recordings(timeline)
+        print_warnings(unused)
         was_finished = is_finished(training, self.out)
         if timeline is not None:
             print(_controllability(timeline))
@@ -113,7 +116,7 @@ class Train(SimulatorOptions, JobOptions):
             )
         if was_finished:
             print(f"this training is already finished; the policies in {self.out} are unchanged")
-        return self._report(trained, timeline)
+        return self._report(trained, timeline, unused)
 
     def _training(self) -> tuple[Training, str | Readouts]:
         from animat.coding.decoder import expect_fit
@@ -180,7 +183,9 @@ class Train(SimulatorOptions, JobOptions):
             )
         return timeline
 
-    def _report(self, trained: dict[str, Policy], timeline: SimulatorTimeline | None) -> dict[str, Any]:
+    def _report(
+        self, trained: dict[str, Policy], timeline: SimulatorTimeline | None, findings: tuple[Finding, ...]
+    ) -> dict[str, Any]:
         """Print and return how good the policies are compared with random actions, and their assessments."""
         from animat.evaluation.table import evaluate
 
@@ -209,7 +214,7 @@ class Train(SimulatorOptions, JobOptions):
             "random": control["mean_return"],
             **{name: policies[name] for name in ("electrode_pulses", "net_return")},
             "recorded_at_min": evaluation.recorded_at_min,
-            "findings": [finding.to_dict() for finding in evaluation.findings],
+            "findings": [finding.to_dict() for finding in (*findings, *evaluation.findings)],
             **({"assessed": assessed} if assessed else {}),
         }
 

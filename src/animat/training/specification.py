@@ -14,9 +14,10 @@ from animat.coding.decoder import expect_one_command
 from animat.coding.encoder import expect_electrode_pulses
 from animat.coding.mapping import Mapping, mapping_named, mapping_to_data, register_mapping
 from animat.environment import Animat, Environment, WithoutNeurons
-from animat.errors import InvalidArgument, shown
+from animat.errors import InvalidArgument, counted, in_min, shown, some_of
 from animat.goals.robot import body_and_goal, without_goal
 from animat.neurons.timeline import SimulatorTimeline
+from animat.recordings.findings import Finding
 from animat.records import Flag, Number, Positive, Seed, Whole, read_record
 from animat.registry import is_ours
 from animat.robots.base import MOST_ITERATIONS, Robot
@@ -178,10 +179,27 @@ class Training:
         return self.duration_min * index / CHUNKS
 
     def with_duration_of(self, timeline: SimulatorTimeline | None) -> Training:
-        """This training with a duration: its own, or else as long as the recordings."""
+        """This training with a duration: its own, or else as long as the recordings, of which the last is used, too."""
         if self.duration_min is not None or timeline is None:
             return self
-        return replace(self, duration_min=timeline.span_min)
+        first_min, last_min = timeline.start_min[[0, -1]].tolist()
+        return replace(self, duration_min=max(timeline.span_min, (last_min - first_min) * CHUNKS / (CHUNKS - 1)))
+
+    def unused_recordings(self, timeline: SimulatorTimeline) -> tuple[Finding, ...]:
+        """A finding if, without a duration of its own, there are recordings that no chunk would begin with."""
+        if not self.shadowing or self.shadowing == "drawn" or self.duration_min is not None:
+            return ()
+        lasting, first_min = self.with_duration_of(timeline), float(timeline.start_min[0])
+        used = {timeline.row_at(first_min + lasting.minute(index)) for index in range(CHUNKS)}
+        unused = [in_min(minute) for row, minute in enumerate(timeline.start_min.tolist()) if row not in used]
+        if not unused:
+            return ()
+        chunk = f"simulators change every {in_min(lasting.minute(1))} of the culture's clock"
+        message = (
+            f"{counted(len(unused), 'recording')} of {len(timeline)} not used in training, in which {chunk}: at "
+            f"{some_of(unused)}; give recordings without long pauses"
+        )
+        return (Finding("unused-recordings", "warning", message, float(len(unused))),)
 
     def environment(self, n_conditions: int) -> Environment[Any]:
         """The environment that the policies act in, without the episode limit."""
