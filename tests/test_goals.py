@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import pickle
+import re
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -327,6 +328,38 @@ def test_a_goal_with_within_has_no_grid_and_says_so() -> None:
     assert "within" in (why_no_grid(robot) or "") and "value_grid" not in lacking(robot)
     with pytest.raises(InvalidArgument, match="within"):
         best_return(WithoutNeurons(robot, (-1.0, 1.0)), None, episodes=0)
+
+
+@pytest.mark.parametrize(
+    ("goal", "beyond"),
+    [
+        (CARTPOLE, ""),
+        ("avoid pole_angle outside -10..10 deg; avoid cart_position outside -0.4..0.4 m", ""),
+        ("avoid pole_angle outside -12..12 deg", ""),
+        (f"{CARTPOLE}; drive cart_position in 0.1..0.3 m", ""),
+        (
+            "avoid pole_angle outside -12..12 deg; drive cart_position above 0.55 m",
+            "cart_position beyond -0.5 to 0.5 m",
+        ),
+        ("drive cart_position above 0.55 m", "cart_position beyond -0.5 to 0.5 m"),
+        ("drive pole_angle in -12..12 deg", "pole_angle beyond -0.209 to 0.209 rad"),
+        ("avoid pole_angle outside -90..90 deg", "pole_angle beyond -0.209 to 0.209 rad"),
+        ("avoid cart_position outside -0.5..0.5 m", "pole_angle beyond -0.209 to 0.209 rad"),
+    ],
+)
+def test_there_is_no_optimum_where_episodes_go_on_beyond_the_grid(goal: str, beyond: str) -> None:
+    robot = with_goal("cartpole", goal)
+    assert (why_no_grid(robot) or "").endswith(beyond) and bool(why_no_grid(robot)) == bool(beyond)
+    if beyond:
+        with pytest.raises(InvalidArgument, match=re.escape(beyond)):
+            best_return(WithoutNeurons(robot, (-1.0, 1.0)), None, episodes=0)
+
+
+@pytest.mark.parametrize(
+    ("name", "goal"), [("navigation", "drive x above 0.6 m"), ("shuttle", "drive cart_position above 0.4 m")]
+)
+def test_where_a_body_stays_within_the_grid_any_goal_has_an_optimum(name: str, goal: str) -> None:
+    assert why_no_grid(with_goal(name, goal)) is None
 
 
 def test_an_end_that_a_command_decides_is_not_known_from_the_state() -> None:

@@ -23,7 +23,7 @@ from animat.responses.condition import Condition
 from animat.responses.quality.responses import FEW_SAMPLES
 from animat.responses.responses import Responses
 from animat.robots.base import Robot
-from animat.robots.grid import Grid, grid_for
+from animat.robots.grid import Grid, grid_of_optimum
 from animat.wrappers import ShuffledDelivery
 
 RESAMPLES = 39
@@ -94,7 +94,7 @@ class WellSampled:
         responses, rng = self.responses, np.random.default_rng(seed)
         drawn = [responses, *(responses.bootstrapped(rng) for _ in range(resamples))]
         cases = [(self.environment, self.fit(each)) for each in drawn]
-        grid = _coarse(grid_for(self.environment.robot), resolution)
+        grid = _coarse(grid_of_optimum(self.environment.robot), resolution)
         values, (least, most) = optimal_values(cases, grid, seed, progress)
         low, high = np.quantile(values[1:] - values[0], [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2], method="weibull")
         low, high = min(low, -high, 0.0), max(high, 0.0)

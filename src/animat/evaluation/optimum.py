@@ -23,7 +23,7 @@ from animat.evaluation.sweeping import bellman_backup, cubic, fill_row_weights, 
 from animat.neurons.history import INITIAL_HISTORY
 from animat.progress import Part, Progress, Silent
 from animat.recordings.findings import Finding
-from animat.robots.grid import Grid, grid_for
+from animat.robots.grid import Grid, grid_of_optimum
 from animat.robots.starts import Starts
 from animat.wrappers import EpisodeLimit, NeuralObservation, ShuffledDelivery, TrialCosts, net_reward, unwrapped
 
@@ -147,7 +147,7 @@ def best_returns(
 
     Args:
         cases: environments, all of the same robot, each with its simulator (None without neurons).
-        grid: over the robot's states; None: `grid_for(robot)`.
+        grid: over the robot's states; None: `grid_of_optimum(robot)`.
         resolution: factor for the steps of the grid along each axis; 0.6 is fast and coarse.
         episodes: of the controller; 0: it is not run, which is faster.
 
@@ -166,7 +166,7 @@ def best_returns(
         if environment.robot != robot:
             raise Mismatch(f"cases: expected the same robot in all, got {robot} and {environment.robot}")
         _expect_known(environment)
-    fine = (grid_for(robot) if grid is None else grid).scaled(resolution)
+    fine = (grid_of_optimum(robot) if grid is None else grid).scaled(resolution)
     coarse = fine.scaled(COARSER, periodic=True)
     progress = Silent() if progress is None else progress
 

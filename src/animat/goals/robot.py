@@ -14,9 +14,10 @@ from jaxtyping import Bool, Float, Int
 from animat.arguments import checked_arguments
 from animat.errors import InvalidArgument, shown, within
 from animat.goals.goal import Goal, Objective, is_text, margin_of, read_goal, region_in_units
+from animat.goals.grid import grid_with_goal
 from animat.goals.tally import Margins, Outcome, Tally, add_iteration, empty_tally, outcome
 from animat.lazy import Array, jax, jnp
-from animat.robots.base import WITHOUT, Quantity, Robot, Transition, Uniforms, capability
+from animat.robots.base import WITHOUT, Quantity, Robot, Transition, Uniforms
 from animat.robots.grid import Grid
 from animat.robots.host import HostRobot
 from animat.robots.registry import robot_from_dict, robot_named, robot_to_dict
@@ -220,32 +221,12 @@ class RobotWithGoal(Robot[GoalState]):
         return reduce(jnp.maximum, (flag * share for flag, share in zip(flags, self._shares, strict=True)))
 
     def _value_grid(self) -> Grid:
-        """The robot's own grid; none for a goal with `within`, as the time outside is not part of the grid."""
-        if any(objective.within is not None for objective in self._objectives):
-            raise InvalidArgument("goal: expected none with `within` for an optimal return, got one")
-        grid: Grid = capability(self.robot, "value_grid")()
-        is_decided = self._is_decided(grid)
-        return replace(
-            grid,
-            to_coordinates=lambda state: grid.to_coordinates(state.robot),
-            to_state=lambda coordinates: self.started(grid.to_state(coordinates)),
-            end_is_known=grid.end_is_known and is_decided,
-            smooth_commands=grid.smooth_commands if is_decided else None,
-        )
+        return _grid_of(self)
 
-    def _is_decided(self, grid: Grid) -> bool:
-        """Whether the state decides if the next iteration ends the episode, for any command; tested on random nodes."""
-        row, node = jax.random.randint(jax.random.key(0), (2, 256), 0, jnp.array([[grid.n_rows], [grid.along.stored]]))
 
-        def margins_after(row: Array, node: Array, chance: float, u: float) -> Array:
-            state = grid.state_at(row, node)
-            robot, _, _ = self.robot.advance(jnp.full(self.noise_size, chance), state, jnp.float32(u))
-            pairs = zip(self._objectives, self._margins(self.robot.observe(robot)), strict=True)
-            margins = [margin for objective, (margin, _) in pairs if objective.can_fail or objective.kind == "reach"]
-            return jnp.stack(margins) if margins else jnp.zeros(0)
-
-        after = jax.vmap(margins_after, (0, 0, None, None))
-        return bool(jnp.allclose(after(row, node, 0.0, -1.0), after(row, node, 1.0, 1.0), atol=1e-5))
+@lru_cache(maxsize=8)
+def _grid_of(robot: RobotWithGoal) -> Grid:
+    return grid_with_goal(robot.robot, robot._objectives, robot._spec, robot.started)
 
 
 @lru_cache(maxsize=8)

@@ -51,7 +51,7 @@ from animat.reality_gap.session_responses import outcomes, read_responses
 from animat.reality_gap.table import INTERVENTION_EPISODES, RealityGap, intervention_table
 from animat.recordings.findings import Finding, warnings_once
 from animat.robots.base import Robot, lacking
-from animat.robots.grid import grid_for, why_no_grid
+from animat.robots.grid import grid_of_optimum, why_no_grid
 from animat.robots.host import HostRobot
 from animat.robots.starts import Starts
 from animat.training.policy import Policy, first_of_alike
@@ -305,7 +305,7 @@ def _optimal_return(
         try:
             # Only the value, which is reported as "about": its uncertainty would take a third longer.
             case = environment, calibration.simulator
-            (value,), _ = optimal_values([case], grid_for(robot).scaled(_RESOLUTION), 1, starts=starts)
+            (value,), _ = optimal_values([case], grid_of_optimum(robot).scaled(_RESOLUTION), 1, starts=starts)
             return float(value), ()
         except Exception as error:
             reason = describe_error(error)

@@ -83,6 +83,7 @@ class Grid:
         end_is_known: whether a state alone decides if the next iteration ends the task; states beyond the ends of
             the axes are then never treated as those just inside.
         noise_in_command: the robot's noise as the largest uniform change of the command either way; None: another form.
+        unsuited: why no optimal return can be computed on it; empty: one can.
     """
 
     along: Axis
@@ -92,6 +93,7 @@ class Grid:
     smooth_commands: int | None = None
     end_is_known: bool = False
     noise_in_command: float | None = None
+    unsuited: str = ""
 
     @property
     def n_rows(self) -> int:
@@ -172,10 +174,18 @@ def grid_for(robot: Robot[Any]) -> Grid:
     return grid
 
 
+def grid_of_optimum(robot: Robot[Any]) -> Grid:
+    """The same for an optimal return; InvalidArgument, too, for one that is unsuited."""
+    grid = grid_for(robot)
+    if grid.unsuited:
+        raise InvalidArgument(grid.unsuited)
+    return grid
+
+
 def why_no_grid(robot: Robot[Any]) -> str | None:
-    """Why there is no grid for this robot; None if there is one."""
+    """Why there is no grid for an optimal return of this robot; None if there is one."""
     try:
-        grid_for(robot)
+        grid_of_optimum(robot)
     except InvalidArgument as error:
         return str(error)
     return None

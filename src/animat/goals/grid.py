@@ -1,0 +1,126 @@
+"""The grid of a robot with a goal, on which optimal returns are computed: the robot's own, where that one suffices."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool
+
+from animat.errors import InvalidArgument
+from animat.goals.goal import Objective, margin_of
+from animat.goals.tally import Margins
+from animat.lazy import Array, jax, jnp
+from animat.robots.base import Quantity, Robot, capability
+from animat.robots.grid import Axis, Grid
+
+_SAMPLES = 4096
+_INSIDE = 1e-3
+"""How far inside the ends of an axis a state is put that is beyond them, in shares of the axis."""
+
+
+def grid_with_goal(
+    robot: Robot[Any],
+    objectives: Sequence[Objective],
+    spec: Mapping[str, Quantity],
+    started: Callable[[Any], Any],
+) -> Grid:
+    """The robot's own grid, for its states with a goal.
+
+    Args:
+        objectives: of the goal.
+        spec: the robot's quantities by name.
+        started: an episode of the robot with its goal that begins with the body in a state.
+
+    It is unsuited if episodes with the goal go on beyond its ends, where the robot's own task ends.
+
+    Raises:
+        InvalidArgument: for a goal with `within`, as the time outside is not part of the grid.
+    """
+    if any(objective.within is not None for objective in objectives):
+        raise InvalidArgument("goal: expected none with `within` for an optimal return, got one")
+    grid: Grid = capability(robot, "value_grid")()
+    left = zip((grid.along, *grid.rows), _left(robot, grid, objectives, spec), strict=True)
+    is_decided = _is_decided(robot, grid, objectives, spec)
+    return replace(
+        grid,
+        to_coordinates=lambda state: grid.to_coordinates(state.robot),
+        to_state=lambda coordinates: started(grid.to_state(coordinates)),
+        end_is_known=grid.end_is_known and is_decided,
+        smooth_commands=grid.smooth_commands if is_decided else None,
+        unsuited=next((_gone_beyond(robot, axis) for axis, is_left in left if is_left), ""),
+    )
+
+
+def _gone_beyond(robot: Robot[Any], axis: Axis) -> str:
+    expected = f"one that ends episodes where the grid of {robot.name} ends, for an optimal return"
+    where = f"{axis.name.removeprefix('next ')} beyond {axis.low:.3g} to {axis.high:.3g} {axis.unit}"
+    return f"goal: expected {expected}, got one with which they go on, {where}"
+
+
+def _margins(objectives: Sequence[Objective], spec: Mapping[str, Quantity], observation: Array) -> Margins:
+    values = dict(zip(spec, observation, strict=True))
+    return [margin_of(objective.region, values, spec) for objective in objectives]
+
+
+def _sampled(grid: Grid, n: int) -> tuple[Array, Array]:
+    """Random nodes: their rows, and their places along these."""
+    row, node = jax.random.randint(jax.random.key(0), (2, n), 0, jnp.array([[grid.n_rows], [grid.along.stored]]))
+    return row, node
+
+
+def _left(
+    robot: Robot[Any], grid: Grid, objectives: Sequence[Objective], spec: Mapping[str, Quantity]
+) -> Bool[np.ndarray, " axes"]:
+    """Whether episodes with the goal go on beyond the ends of each axis where the task ended, and depend on how far.
+
+    Tested on random nodes, from which an iteration leads beyond an end. Axes at whose ends the robot's own task does
+    not end, such as those of velocities, are as good for the goal as they are for the task.
+    """
+    axes = (grid.along, *grid.rows)
+    ending = [objective.kind in ("avoid", "reach") for objective in objectives]
+
+    def goal_ends(margins: Margins) -> Array:
+        return jnp.any(jnp.stack([inside & ends for (_, inside), ends in zip(margins, ending, strict=True)]))
+
+    def apart(state: Any) -> Array:
+        """How far the state is from the edge of each part of each region: unlike margins, also far away."""
+        values = dict(zip(spec, robot.observe(state), strict=True))
+        return jnp.stack([part.margin(values, spec) for objective in objectives for part in objective.region])
+
+    def leaves(row: Array, node: Array, u: Array) -> Array:
+        uniforms = jnp.full(robot.noise_size, 0.5)
+        after, _, _ = robot.advance(uniforms, grid.state_at(row, node), u)
+        later, _, task_ends = robot.advance(uniforms, after, u)
+        margins = _margins(objectives, spec, robot.observe(after))
+        goes_on = task_ends & ~goal_ends(margins) & ~goal_ends(_margins(objectives, spec, robot.observe(later)))
+        coordinates, found = grid.to_coordinates(after), []
+        for number, axis in enumerate(axes):
+            spare = 0.0 if axis.periodic else _INSIDE * (axis.high - axis.low)
+            value = coordinates[number]
+            inside = value if axis.periodic else jnp.clip(value, axis.low + spare, axis.high - spare)
+            within = grid.to_state((*coordinates[:number], inside, *coordinates[number + 1 :]))
+            _, _, ends_within = robot.advance(uniforms, within, u)
+            # The first coordinate does not affect how the others move, but these may affect all.
+            differs = number > 0 or jnp.any(jnp.abs(apart(after) - apart(within)) > _INSIDE)
+            found.append(goes_on & ~ends_within & differs & (jnp.abs(value - inside) > spare))
+        return jnp.stack(found)
+
+    each = jax.vmap(jax.vmap(leaves, (None, None, 0)), (0, 0, None))
+    return np.asarray(jax.jit(each)(*_sampled(grid, _SAMPLES), jnp.array([-1.0, 1.0])).any(axis=(0, 1)))
+
+
+def _is_decided(robot: Robot[Any], grid: Grid, objectives: Sequence[Objective], spec: Mapping[str, Quantity]) -> bool:
+    """Whether the state decides if the next iteration ends the episode, for any command; tested on random nodes."""
+
+    def margins_after(row: Array, node: Array, chance: float, u: float) -> Array:
+        after, _, _ = robot.advance(jnp.full(robot.noise_size, chance), grid.state_at(row, node), jnp.float32(u))
+        pairs = zip(objectives, _margins(objectives, spec, robot.observe(after)), strict=True)
+        margins = [margin for objective, (margin, _) in pairs if objective.can_fail or objective.kind == "reach"]
+        return jnp.stack(margins) if margins else jnp.zeros(0)
+
+    after = jax.vmap(margins_after, (0, 0, None, None))
+    nodes = _sampled(grid, 256)
+    return bool(jnp.allclose(after(*nodes, 0.0, -1.0), after(*nodes, 1.0, 1.0), atol=1e-5))
