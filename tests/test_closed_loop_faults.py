@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import errno
 import os
 import re
@@ -349,6 +350,39 @@ def test_a_policy_that_hangs(tmp_path: Path, is_interrupted: bool, little_grace:
         if thread is not None:
             thread.join(10)
         assert culture.pulses == pulses
+
+
+@pytest.mark.usefixtures("in_the_foreground")
+def test_ctrl_c_is_not_held_up_by_the_patience_with_an_agent(
+    tmp_path: Path, little_grace: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("animat.closed_loop.running._UNANSWERED_S", 0.1)
+    released = threading.Event()
+
+    class Hangs:
+        def act(self, observation: Any, rng: np.random.Generator) -> int:
+            os.kill(os.getpid(), signal.SIGINT)
+            released.wait(60)
+            return 0
+
+    with FakeCulture() as culture:
+        try:
+            session = run_session(culture, loop_of(robot=LONG, patience_s=50.0), [Agent("it", "", Hangs())], tmp_path)
+        finally:
+            released.set()
+    assert (session.ending.by, session.ending.message) == ("person", "stopped by a person (Ctrl-C or kill)")
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), GeneratorExit(), asyncio.CancelledError()])
+def test_whatever_an_agent_raises_ends_the_session(tmp_path: Path, error: BaseException) -> None:
+    class Raises:
+        def act(self, observation: Any, rng: np.random.Generator) -> int:
+            raise error
+
+    with FakeCulture() as culture:
+        session = run_session(culture, loop_of(robot=LONG), [Agent("it", "", Raises())], tmp_path)
+    assert session.ending.by == "controller"
+    assert session.ending.message.startswith(f"it raised {type(error).__name__}")
 
 
 @pytest.mark.parametrize("how", ["takes a while", "raises", "hangs"])

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import _thread
 import os
 import re
 import signal
+import threading
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -386,3 +388,63 @@ def test_on_a_robot_outside_jax_an_agent_in_jax_is_tried_too(agent: Actor, messa
         evaluate({"p0": policy}, timeline, episodes=2, controls=[], agents={"mine": agent})
     # It is only asked for what the robot observes.
     evaluate({"p0": policy}, timeline, episodes=2, controls=[], agents={"mine": Tabular(jnp.arange(5)[None])})
+
+
+class OneEpisode:
+    """Lives as long as an episode, and wants to see nothing else."""
+
+    def __init__(self, limit_rad: float = np.inf) -> None:
+        self.limit_rad, self.seen = limit_rad, 0
+
+    def begin(self) -> OneEpisode:
+        return OneEpisode(0.2095)
+
+    def act(self, observation: np.ndarray, rng: np.random.Generator) -> int:
+        self.seen += 1
+        if abs(observation[2]) > self.limit_rad or self.seen > 60:
+            raise ValueError(f"asked after its end, at {observation}")
+        return 4
+
+
+def test_an_agent_is_not_asked_after_its_episode() -> None:
+    timeline = five_conditions()
+    policies = {"p0": policy_of(timeline, Cartpole(episode_limit=60))}
+    row = evaluate(policies, timeline, episodes=40, controls=[], agents={"it": OneEpisode()}).rows[1]
+    assert np.ptp(row.episodes.lengths) > 0
+
+
+class OnlyBegins:
+    def begin(self) -> Plain:
+        return Plain()
+
+
+def test_an_agent_may_have_begin_alone(tmp_path: Path) -> None:
+    timeline = five_conditions()
+    policies = {"p0": policy_of(timeline, Cartpole(episode_limit=30))}
+    agents = {"begins": OnlyBegins(), "plain": Plain()}
+    found = evaluate(policies, timeline, episodes=5, controls=[], agents=agents)
+    assert found.rows[1].episodes.returns.tolist() == found.rows[2].episodes.returns.tolist()
+    with pytest.raises(InvalidArgument, match=r"agents: expected a name for each, got ''"):
+        evaluate(policies, timeline, episodes=5, controls=[], agents={"": Plain()})
+
+
+def test_ctrl_c_ends_an_evaluation_whose_agent_hangs() -> None:
+    released = threading.Event()
+
+    class Hangs:
+        def act(self, observation: np.ndarray, rng: np.random.Generator) -> int:
+            _thread.interrupt_main()
+            released.wait(60)
+            return 0
+
+    timeline = five_conditions()
+    policies = {"p0": policy_of(timeline, Cartpole(episode_limit=30))}
+    began_s = time.monotonic()
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            evaluate(policies, timeline, episodes=3, controls=[], agents={"it": Hangs()})
+        assert time.monotonic() - began_s < 30
+    finally:
+        released.set()
+        for thread in [each for each in threading.enumerate() if each.name == "agent it"]:
+            thread.join()

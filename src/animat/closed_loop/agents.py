@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Float64
 from animat.environment import Animat, Environment
 from animat.errors import InvalidArgument, shown
 from animat.evaluation.controls import RANDOM, Control, Delivered
-from animat.evaluation.own_agents import Called, Controller, sees_neurons
+from animat.evaluation.own_agents import Called, Controller, acts, sees_neurons
 from animat.evaluation.rollouts import Actor, Constant, Networks, Uniform
 
 
@@ -109,7 +109,7 @@ class Agent:
             raise InvalidArgument(f"{self.name}: delivery: expected one of {kinds}, got {self.delivery!r}")
         controllers = self.controller.values() if isinstance(self.controller, Mapping) else (self.controller,)
         for controller in controllers:
-            if not callable(getattr(controller, "act", None)):
+            if not acts(controller):
                 raise InvalidArgument(f"{self.name}: controller: expected a method `act`, got {shown(controller)}")
 
     def sees_neurons(self, turn: int) -> bool:

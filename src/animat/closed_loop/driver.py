@@ -357,8 +357,8 @@ class Driver:
         self._set_deadline(who)
         try:
             return ask()
-        except (Exception, SystemExit) as error:
-            # Libraries exit, too.
+        except BaseException as error:
+            # Libraries exit, and raise what Ctrl-C and cancelled tasks do, too.
             raise Stop(Ending(by, f"{who} raised {describe_error(error)}")) from error
 
     def _set_deadline(self, who: str, in_s: float = 0.0) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import json
+import math
 import os
 import signal
 import sys
@@ -50,6 +51,8 @@ _SYNC_S = 0.5
 """Time between flushes of the log to disk: with polling and writing, a power cut then costs under 1 s."""
 _GRACE_S = 2.0
 """How long the loop's thread has to end after a request to stop."""
+_UNANSWERED_S = 2.0
+"""And after Ctrl-C before that, however long its patience with an agent."""
 
 
 def run_session(
@@ -126,6 +129,7 @@ class _Supervisor:
         self._ending: Ending | None = None
         self._logged_request = -1
         self._not_halted: str | None = None
+        self._by_person: tuple[float, Ending] | None = None
         self._left_out = driver.culture.left_out
 
     def run(self) -> Ending:
@@ -191,7 +195,7 @@ class _Supervisor:
                     # Why the loop ended counts; `_finish` tries again, and says what is lost.
                     break
                 return Ending("disk", f"the log cannot be written: {error.strerror or error}")
-            if thread.is_alive() and (stopped := driver.stopped_by_file()):
+            if thread.is_alive() and (stopped := self._stopped() or driver.stopped_by_file()):
                 # The loop checks before its next trial; do not wait for the pulses of the current one.
                 return stopped
             by_s, who = driver.deadline
@@ -260,7 +264,14 @@ class _Supervisor:
 
     def _stop_for_person(self) -> None:
         self._driver.is_stopped = True
-        self._halt(Ending("person", "stopped by a person (Ctrl-C or kill)"))
+        ending = Ending("person", "stopped by a person (Ctrl-C or kill)")
+        self._by_person = self._by_person or (time.monotonic(), ending)
+        self._halt(ending)
+
+    def _stopped(self) -> Ending | None:
+        """The ending if a person stopped the loop some time ago, and it does not end by itself."""
+        since_s, ending = self._by_person or (math.inf, None)
+        return ending if time.monotonic() > since_s + _UNANSWERED_S else None
 
     def _halt(self, ending: Ending) -> None:
         """Stop the culture in a separate thread: a backend that hangs must not block the end as well."""

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Array, Float, Key, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray
 
 from animat.compilation import COMPILER_OPTIONS
 from animat.environment import Environment, Neurons, State
@@ -86,7 +86,7 @@ def paths_on_host(
         actor, alone = jax.tree.map(lambda part, number=number: part[number : number + 1], actors), key[None]
         bodies = Bodies(robot, [(seed, number)])
         observations[number] = bodies.begin()
-        for command, _, stepped in _iterations(environment, simulator, actor, alone, bodies):
+        for command, _, stepped in _iterations(environment, simulator, actor, alone, bodies, 1):
             commands[number, lengths[number]] = command[0].reshape(robot.command_shape)
             lengths[number] += 1
             observations[number, lengths[number] :] = stepped.observation
@@ -111,7 +111,7 @@ def _count_wave(
     going = np.ones(counts.returns.shape, bool)
     n_conditions = counts.presented.shape[1]
     of_actor, commanded = np.indices(counts.returns.shape)[0], np.zeros_like(counts.commanded)
-    for command, delivered, stepped in _iterations(environment, simulator, actors, keys, bodies):
+    for command, delivered, stepped in _iterations(environment, simulator, actors, keys, bodies, n):
         of_bodies = stepped.reward, stepped.terminated, stepped.ended
         if (wrong := delivered[(delivered < 0) | (delivered >= n_conditions)]).size and n_conditions:
             expected = f"the index of a condition, a whole number from 0 to {n_conditions - 1}"
@@ -131,16 +131,22 @@ def _count_wave(
 
 
 def _iterations(
-    environment: Environment[Any], simulator: Neurons, actors: Any, keys: Key[Array, " actors"], bodies: Bodies
+    environment: Environment[Any], simulator: Neurons, actors: Any, keys: Key[Array, " actors"], bodies: Bodies, n: int
 ) -> Iterator[tuple[np.ndarray, np.ndarray, StepResult]]:
-    """Commands, delivered conditions and results of each iteration of begun bodies; ended episodes begin again."""
+    """Commands, delivered conditions and results of each iteration of begun bodies; ended episodes begin again.
+
+    Of each actor's bodies the first `n` count, until they first end.
+    """
     shape = len(keys), len(bodies) // len(keys)
     state = _started(environment, keys, shape[1])
+    going = np.tile(np.arange(shape[1]) < n, (len(keys), 1))
     for iteration in range(environment.robot.episode_limit):
         state = state._replace(robot=bodies.observation.reshape(*shape, -1))
-        command, state, delivered = _iteration(environment, simulator, actors, keys, np.int32(iteration), state)
+        given = environment, simulator, actors, keys, np.int32(iteration), state, going.copy()
+        command, state, delivered = actors.apart(lambda given=given: jax.block_until_ready(_iteration(*given)))
         stepped = bodies.step(np.asarray(command).reshape(len(bodies), -1))
         yield np.asarray(command), np.asarray(delivered), stepped
+        going &= ~stepped.ended.reshape(shape)
         if stepped.ended.any():
             bodies.begin(np.flatnonzero(stepped.ended).tolist())
 
@@ -167,18 +173,19 @@ def _iteration(
     keys: Key[Array, " actors"],
     iteration: Array,
     state: State,
+    going: Bool[Array, "actors episodes"],
 ) -> tuple[Float[Array, "actors episodes *commands"], State, Array]:
     """Commands, the next state, and the delivered conditions."""
 
-    def of_actor(actor: Any, key: PRNGKeyArray, state: State) -> tuple[Array, State, Array]:
+    def of_actor(actor: Any, key: PRNGKeyArray, state: State, going: Array) -> tuple[Array, State, Array]:
         n, n_drawn = len(state.iteration), environment.n_drawn
         shape = n, n_drawn + environment.noise_size
         uniforms = jax.random.uniform(jax.random.fold_in(key, iteration), shape, np.float32)
         observation = jax.vmap(environment.observe)(state) / environment.scales
-        action = actor.act(environment, observation, uniforms[:, :n_drawn])
+        action = actor.act_while(environment, observation, uniforms[:, :n_drawn], going)
         delivered, answer, command = jax.vmap(environment.respond, (0, 0, 0, None))(
             uniforms[:, n_drawn:], state, action, simulator
         )
         return command, state._replace(iteration=state.iteration + 1, neurons=answer.history), delivered
 
-    return jax.vmap(of_actor)(actors, keys, state)
+    return jax.vmap(of_actor)(actors, keys, state, going)

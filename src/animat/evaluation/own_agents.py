@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable, Collection, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future
 from dataclasses import dataclass
+from threading import Thread
 from typing import Any, Protocol, TypeVar, final
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from animat.environment import Environment, Neurons
 from animat.errors import InvalidArgument, first_line, shown, some_of, within
@@ -26,6 +27,8 @@ T = TypeVar("T")
 
 _GRID = 2**24
 """Uniforms of single precision are multiples of 1 / 2^24."""
+_GRACE_S = 2.0
+"""How long Ctrl-C waits for a controller that is being called."""
 _ASKED_AGAIN = 20
 """So many decisions of a roll-out are asked for again at its end."""
 
@@ -43,7 +46,7 @@ class Controller(Protocol):
 @final
 @jax.tree_util.register_static
 class Called(Actor):
-    """A controller outside JAX as an actor: it is called for every observation of every episode.
+    """A controller outside JAX as an actor: it is called for every observation of every episode, up to its end.
 
     What goes wrong in a call is kept, as JAX would report it in its own words; see `expect_no_failure`. Only one
     roll-out at a time can use it.
@@ -56,16 +59,23 @@ class Called(Actor):
         self._answers: list[tuple[np.ndarray, float, int, int]] = []
 
     def act(self, environment: Environment[Any], observation: Seen, uniforms: Uniforms) -> Array:
+        return self.act_while(environment, observation, uniforms, jnp.ones(len(observation), bool))
+
+    def act_while(
+        self, environment: Environment[Any], observation: Seen, uniforms: Uniforms, going: Bool[Array, " episodes"]
+    ) -> Array:
         n, seen = environment.n_actions or 0, observation * environment.scales
         if not sees_neurons(self.controller):
             seen = seen[:, : len(environment.robot.observation_spec)]
 
-        def choose(observation: np.ndarray, uniforms: np.ndarray) -> np.ndarray:
-            asked = list(enumerate(zip(observation, uniforms, strict=True)))
-            return np.array([self._choose(episode, *each, n) for episode, each in asked], np.int32)
+        def choose(observation: np.ndarray, uniforms: np.ndarray, going: np.ndarray) -> np.ndarray:
+            chosen = np.zeros(len(observation), np.int32)
+            for episode in np.flatnonzero(going).tolist():
+                chosen[episode] = self._choose(episode, observation[episode], uniforms[episode], n)
+            return chosen
 
         chosen = jax.ShapeDtypeStruct(observation.shape[:1], jnp.int32)
-        called: Array = jax.pure_callback(choose, chosen, seen, uniforms[:, 0], vmap_method="sequential")
+        called: Array = jax.pure_callback(choose, chosen, seen, uniforms[:, 0], going, vmap_method="sequential")
         return called
 
     def _choose(self, episode: int, observation: np.ndarray, uniform: float, n_actions: int) -> int:
@@ -91,13 +101,26 @@ class Called(Actor):
 
     def apart(self, run: Callable[[], T]) -> T:
         # Ctrl-C reaches the main thread only, and not while it waits for JAX, which would be after the last episode.
-        with ThreadPoolExecutor(1) as thread:
+        result = Future[T]()
+
+        def complete() -> None:
             try:
-                return thread.submit(run).result()
+                result.set_result(run())
             except BaseException as error:
-                # The controller is called no more, so the thread ends soon.
-                self._failure = error
-                raise
+                result.set_exception(error)
+
+        thread = Thread(target=complete, name=f"agent {self.name}", daemon=True)
+        thread.start()
+        try:
+            while thread.is_alive():
+                # Without a time it would not look for Ctrl-C that another thread received.
+                thread.join(0.1)
+            return result.result()
+        except BaseException as error:
+            # The controller is called no more, so the thread ends soon, unless the controller hangs.
+            self._failure = error
+            thread.join(_GRACE_S)
+            raise
 
     def expect_no_failure(self) -> None:
         for observation, uniform, n_actions, chosen in [] if hasattr(self.controller, "begin") else [*self._answers]:
@@ -113,6 +136,11 @@ class Called(Actor):
                 raise failure
             what = str(failure) if isinstance(failure, InvalidArgument) else first_line(failure)
             raise InvalidArgument(f"agents: {self.name}: {what}") from failure
+
+
+def acts(controller: object) -> bool:
+    """Whether it acts, or what it begins does."""
+    return any(callable(getattr(controller, name, None)) for name in ("act", "begin"))
 
 
 def begun(controller: Controller) -> Controller:
@@ -158,7 +186,9 @@ def controls_of_own(
     for name, agent in agents.items():
         if name in taken:
             raise InvalidArgument(f"agents: expected names other than {some_of(sorted(taken))}, got {name}")
-        if not callable(getattr(agent, "act", None)):
+        if not name.strip():
+            raise InvalidArgument(f"agents: expected a name for each, got {name!r}")
+        if not acts(agent):
             raise InvalidArgument(f"agents: {name}: expected an Actor, or a method `act`, got {shown(agent)}")
         has_neurons = len(environment.observation_spec) > len(environment.robot.observation_spec)
         if isinstance(agent, Actor):

@@ -46,6 +46,12 @@ class Actor(abc.ABC):
         arrays = jax.tree.leaves(self)
         return len(arrays[0]) if arrays else 1
 
+    def act_while(
+        self, environment: Environment[Any], observation: Seen, uniforms: Uniforms, going: Bool[Array, " episodes"]
+    ) -> Array:
+        """The same, where an action counts only in the episodes that are `going`."""
+        return self.act(environment, observation, uniforms)
+
     # Only actors that call something outside JAX can fail, remember, or take long.
     def begin(self) -> None:  # noqa: B027
         """Forget the episodes so far, as new ones begin."""
@@ -267,7 +273,7 @@ def _roll_out(
         state, going, returns, lengths, presented, commanded, terminated = carry
         uniforms = jax.random.uniform(key, (episodes, n_drawn + environment.noise_size), jnp.float32)
         observation = jax.vmap(environment.observe)(state) / environment.scales
-        action = actor.act(environment, observation, uniforms[:, :n_drawn])
+        action = actor.act_while(environment, observation, uniforms[:, :n_drawn], going)
         after = jax.vmap(environment.advance, (0, 0, 0, None))(uniforms[:, n_drawn:], state, action, simulator)
         # An ended episode is carried along, but no longer counted.
         returns = returns + jnp.where(going, after.reward, 0.0)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import replace
@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from animat.environment import Environment
+from animat.errors import some_of
 from animat.evaluation.controls import Control, Delivered
 from animat.evaluation.own_agents import Called
 from animat.evaluation.rollouts import Episodes, Uniform
@@ -23,6 +24,7 @@ from animat.progress import Progress, Silent
 from animat.reality_gap.calibration import Calibration
 from animat.reality_gap.row import bootstrap_interval
 from animat.reality_gap.session_responses import CommandSums
+from animat.recordings.findings import Finding
 from animat.robots.base import Robot
 from animat.robots.host import HostRobot
 from animat.robots.starts import Starts
@@ -153,6 +155,17 @@ def episodes_each(robot: Robot[Any], starts: Starts | None, *, is_slow: bool = F
     """Episodes of each policy in a roll-out, from each start equally many; fewer where a robot or an agent is slow."""
     least = episodes_on_host(robot) if is_slow or isinstance(robot, HostRobot) else EPISODES
     return least if starts is None else starts.rounds * math.ceil(least / starts.rounds)
+
+
+def few_predicted(robot: Robot[Any], starts: Starts | None, called: Sequence[str]) -> Iterator[Finding]:
+    """A note if predictions are from few episodes: the robot is stepped, or agents are `called`, outside JAX."""
+    who = f"{robot.name} is stepped" if isinstance(robot, HostRobot) else f"{some_of(called)}: called" if called else ""
+    if who:
+        episodes = ROLL_OUTS * episodes_each(robot, starts, is_slow=True)
+        few = (
+            f"predicted returns are from {episodes} episodes, and their intervals from {BOOTSTRAPS_ON_HOST} bootstraps"
+        )
+        yield Finding("few-predicted", "note", f"{who} outside JAX: {few}")
 
 
 def roll_out_seed(seed: int, group: int, on: int) -> int:

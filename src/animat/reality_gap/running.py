@@ -36,12 +36,10 @@ from animat.progress import Progress, in_phase
 from animat.reality_gap.calibration import Calibration
 from animat.reality_gap.outlook import outlook
 from animat.reality_gap.predicting import (
-    BOOTSTRAPS_ON_HOST,
     EPISODES,
     MOST_ON_HOST,
-    ROLL_OUTS,
     Prediction,
-    episodes_each,
+    few_predicted,
     pool,
     predict,
 )
@@ -135,7 +133,8 @@ def run_policies(
     age_min, starts = calibration.age_min(culture), _starts(loop.robot, seed, episodes)
     if calibration.recording is not None:
         unknown += differences(calibration.recording, culture, patterns_too=loop.encoder.takes_patterns)
-    findings = unknown + findings + tuple(_warnings(first, loop, calibration, age_min, starts))
+    called = [name for name, agent in (agents or {}).items() if not isinstance(agent, Actor)]
+    findings = unknown + findings + tuple(_warnings(first, loop, calibration, age_min, starts, called))
     account = account or Account()
     animat = Animat(loop.robot, loop.mapping, len(loop.conditions))
     environment: Environment[Any] = NeuralObservation(animat) if first.neural_observation else animat
@@ -245,7 +244,7 @@ def run_policies(
 
 
 def _warnings(
-    first: Policy, loop: Loop, calibration: Calibration, age_min: float, starts: Starts | None
+    first: Policy, loop: Loop, calibration: Calibration, age_min: float, starts: Starts | None, called: Sequence[str]
 ) -> Iterator[Finding]:
     """Known reasons why the measured return may differ from the prediction."""
     yield from transfer.other_calibration(first.presentation, calibration.presentation)
@@ -273,13 +272,7 @@ def _warnings(
     yield from transfer.faster_than_recorded(calibration.recording, loop.conditions)
     yield from transfer.old_calibration(age_min, "this session")
     yield from transfer.no_memory(calibration.findings, calibration.presentation, has_memory=has_memory)
-    if isinstance(loop.robot, HostRobot):
-        episodes_predicted = ROLL_OUTS * episodes_each(loop.robot, starts)
-        message = (
-            f"{loop.robot.name} is stepped outside JAX: predicted returns are from {episodes_predicted} episodes, and "
-            f"their intervals from {BOOTSTRAPS_ON_HOST} bootstraps"
-        )
-        yield Finding("few-predicted", "note", message)
+    yield from few_predicted(loop.robot, starts, called)
 
 
 def _starts(robot: Robot[Any], seed: int, episodes: int) -> Starts | None:

@@ -230,7 +230,9 @@ def call_body(robot: HostRobot, what: str, function: Callable[..., Answer], *arg
         # Ours already have a one-line message.
         raise
     except (Exception, SystemExit) as error:
-        raise BodyFailed(f"{robot.name}: expected {what} to succeed, got {first_line(error)}") from error
+        # MuJoCo's pictures need a display, or to be told that there is none.
+        remedy = ": without a display set MUJOCO_GL=egl (or osmesa)" if "OpenGL" in str(error) else ""
+        raise BodyFailed(f"{robot.name}: expected {what} to succeed, got {first_line(error)}{remedy}") from error
 
 
 class _TooLongError(BaseException):

@@ -29,12 +29,18 @@ FINEST_RESOLUTION = 2.0
 """Of the optimal return's grid: the cartpole's tables take 2 GiB there, and grow with its fourth power."""
 
 
+_NO_NAMES = ("na", "null", "none", "true", "false")
+"""In small letters, what programs that read tables take for something else than text."""
+
+
 def _check_name(name: str) -> str:
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9 ._-]{0,60}", name):
         raise ValueError(f"expected letters, digits, spaces, dots and dashes, got {shown(name)}")
     try:
         float(name)
     except ValueError:
+        if name.lower() in _NO_NAMES:
+            raise ValueError(f"expected a name, got {name!r}, which would not be read as text in a table") from None
         return name
     raise ValueError(f"expected a name, got {name!r}, which would be read as a number in a table")
 
