@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from animat.cultures.virtual import VirtualCulture
 from animat.errors import DeviceFailed, InvalidFile
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.reading import read_recording, read_recordings
+from animat.recordings.recorded_culture import RecordedCulture
 from animat.recordings.recording import Recording
 from animat.stimulation.protocol import Protocol
 from animat.stimulation.pulse import BALANCED_PULSE
@@ -343,3 +345,30 @@ def test_a_second_ctrl_c_or_a_kill_loses_nothing(tmp_path: Path, monkeypatch: py
         assert getattr(kept, name) == getattr(recording, name)
     assert kept.provenance.keys() == recording.provenance.keys() and kept.recorded_at is not None
     assert kept.spike_times_s.tolist() == recording.spike_times_s.tolist()
+
+
+def test_recover_keeps_what_a_killed_recording_had_without_a_pulse(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    culture, *_ = on_maxone(monkeypatch)
+    with culture:
+        recording = culture.record(Protocol(**vars(MIXED) | {"pulse": BALANCED_PULSE, "trials": 20}), 1)
+    live = tmp_path / "live"
+    (live / "recordings").mkdir(parents=True)
+    PartialRecording(live / "recordings")(lambda: recording)
+    for command in (["inspect", str(live / "recordings")], ["live", "cartpole", "--out", str(live)]):
+        assert main(command) == 1 and f"animat recover {live}" in capsys.readouterr().err
+    assert main(["recover", str(live), "--json"]) == 0
+    kept = live / "recordings" / "interrupted" / "recording_0000_min.nwb"
+    assert json.loads(capsys.readouterr().out.splitlines()[-1]) == {"recordings": [str(kept)]}
+    assert read_recording(kept).equals(recording) and not (live / "recordings" / UNDER_WAY).exists()
+    # A damaged one stays as it is.
+    (live / "recordings" / UNDER_WAY).write_bytes(b"PK\x03\x04 cut off")
+    assert main(["recover", str(live / "recordings")]) == 0
+    assert (live / "recordings" / "interrupted" / "damaged.npz").read_bytes() == b"PK\x03\x04 cut off"
+    # What can be made again is not kept.
+    provenance = {"source": "virtual culture: simulated", "seed": "1"}
+    virtual = replace(recording, culture=RecordedCulture("virtual", 1), provenance=provenance, recorded_at=None)
+    PartialRecording(live / "recordings")(lambda: virtual)
+    assert main(["recover", str(live / "recordings")]) == 0
+    assert "nothing to keep" in capsys.readouterr().out and not (live / "recordings" / UNDER_WAY).exists()

@@ -1,4 +1,4 @@
-"""The command that recovers the recording of a session that was killed."""
+"""The command that recovers what was recorded by a run that was killed."""
 
 from __future__ import annotations
 
@@ -15,12 +15,33 @@ from animat.columns import align_columns
 
 @dataclass(frozen=True)
 class Recover(Command):
-    """Write the recording of a closed-loop session that was killed, from its log."""
+    """Write the recording of a closed-loop session that was killed, from its log, or what a killed recording of a
+    device had recorded"""
 
     session: Positional[Path] = Path("session")
-    """The session's folder"""
+    """The session's folder, or one of recordings"""
 
     def run(self) -> dict[str, Any]:
+        from animat.recordings.formats.npz import UNDER_WAY
+
+        folders = [each for each in (self.session, self.session / "recordings") if (each / UNDER_WAY).exists()]
+        return self._recording(folders[0]) if folders else self._session()
+
+    def _recording(self, folder: Path) -> dict[str, Any]:
+        from animat.cultures.under_way import INTERRUPTED, keep_interrupted
+        from animat.writing import exclusive_lock
+
+        before = set((folder / INTERRUPTED).glob("*"))
+        with exclusive_lock(folder):
+            keep_interrupted(folder)
+        kept = sorted(set((folder / INTERRUPTED).glob("*")) - before)
+        for file in kept:
+            print(f"{file}: what a run that was killed had recorded")
+        if not kept:
+            print(f"{folder}: nothing to keep: the recording that was cut short can be made again")
+        return {"recordings": [str(file) for file in kept]}
+
+    def _session(self) -> dict[str, Any]:
         from animat.closed_loop.session import lost_message, recover_session, unanswered_message
         from animat.progress import Bar
         from animat.watch.tail import by_agent

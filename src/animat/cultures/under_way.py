@@ -13,17 +13,15 @@ from typing import Self
 
 import numpy as np
 
-from animat.errors import AnimatError, InvalidFile, counted
+from animat.errors import AnimatError, InvalidFile, as_invalid_file, counted
 from animat.recordings.columns import columns_of
-from animat.recordings.formats.npz import METADATA
+from animat.recordings.formats.npz import METADATA, UNDER_WAY
 from animat.recordings.formats.nwb import recording_name, write_nwb
 from animat.recordings.metadata import to_metadata
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
 from animat.writing import atomic_write, clear_away, clear_leftovers
 
-UNDER_WAY = ".under-way.npz"
-"""Its name in the folder of the recordings; hidden, so that no reader takes it for one of them."""
 EVERY_S = 3.0
 """Shortest time between two writes."""
 INTERRUPTED = "interrupted"
@@ -50,14 +48,7 @@ class PartialRecording:
         self._so_far: Callable[[], Recording] | None = None
 
     def __enter__(self) -> Self:
-        if self._path.exists():
-            # That of a run that was killed.
-            left = None
-            with suppress(AnimatError):
-                left = read_recording(self._path)
-            if left is not None and (left.culture is None or left.culture.kind not in _REPEATABLE):
-                _keep(left, self._path.parent / INTERRUPTED)
-        self.remove()
+        keep_interrupted(self._path.parent)
         return self
 
     def __call__(self, so_far: Callable[[], Recording]) -> None:
@@ -112,11 +103,34 @@ class PartialRecording:
         clear_leftovers(self._path.parent, UNDER_WAY)
 
 
+def keep_interrupted(folder: Path) -> None:
+    """Keep what a killed run had recorded of a device, as a recording in `interrupted`, and remove the rest.
+
+    A damaged file goes there as it is. Raises InvalidFile if it cannot be kept; it then stays where it is.
+    """
+    left = folder / UNDER_WAY
+    if left.exists():
+        try:
+            recording = read_recording(left)
+        except AnimatError:
+            with as_invalid_file(folder / INTERRUPTED, "cannot be written"):
+                (folder / INTERRUPTED).mkdir(exist_ok=True)
+                left.replace(_unused(folder / INTERRUPTED / "damaged.npz"))
+        else:
+            if recording.culture is None or recording.culture.kind not in _REPEATABLE:
+                _keep(recording, folder / INTERRUPTED)
+    PartialRecording(folder).remove()
+
+
+def _unused(file: Path) -> Path:
+    """The file, with a number if there is one already."""
+    numbered = (file.with_name(f"{file.stem}_{number}{file.suffix}") for number in count(2))
+    return next(each for each in chain([file], numbered) if not each.exists())
+
+
 def _keep(recording: Recording, folder: Path) -> str:
     """Write a recording that was cut short; returns what to tell the user. Raises InvalidFile if that fails."""
-    name = Path(recording_name(round(recording.start_min, 3)))
-    numbered = (folder / f"{name.stem}_{number}{name.suffix}" for number in count(2))
-    file = next(each for each in chain([folder / name], numbered) if not each.exists())
+    file = _unused(folder / recording_name(round(recording.start_min, 3)))
     try:
         folder.mkdir(exist_ok=True)
     except OSError as error:

@@ -17,6 +17,7 @@ from animat.cultures.budget import Account
 from animat.cultures.series import minutes_of
 from animat.errors import BudgetSpent, InvalidArgument, Mismatch
 from animat.plain_file import expect_no_file
+from animat.recordings.formats.npz import UNDER_WAY
 from animat.records import Positive, record
 from animat.responses.condition import Condition
 from animat.stimulation.places import NONE
@@ -104,5 +105,7 @@ def check_plan(
     Loop(training.robot, training.mapping, conditions, np.zeros(N_PERCENTILES, np.float32), **loop_settings)
     expect_no_file(folder, "the live run")
     if folder.exists() and any(file.name != LOCK for file in folder.iterdir()):
-        remedy = f"choose another, or see what it holds: animat watch {folder}"
+        left = (folder / RECORDINGS / UNDER_WAY).exists()
+        see = f"animat {'recover' if left else 'watch'} {folder}"
+        remedy = f"choose another, or {'keep what was recorded' if left else 'see what it holds'}: {see}"
         raise Mismatch(f"{folder}: expected an empty folder for a live run, got one with files; {remedy}")

@@ -17,7 +17,7 @@ from animat.plain_file import expect_plain_file, is_absent, is_folder
 from animat.recordings.columns import with_start
 from animat.recordings.formats.csv import read_csv
 from animat.recordings.formats.hdf5 import DAMAGE
-from animat.recordings.formats.npz import read_npz
+from animat.recordings.formats.npz import UNDER_WAY, read_npz
 from animat.recordings.formats.response_files import read_response_npz, read_response_table
 from animat.recordings.formats.text_table import GZIP, read_table
 from animat.recordings.hdf5_subprocess import read_hdf5_in_subprocess
@@ -190,7 +190,12 @@ def _files(path: Path) -> list[Path]:
         listed = [file for file in path.iterdir() if not file.name.startswith(".")]
     files = sorted(file for file in listed if any(map(file.match, IN_FOLDERS)))
     if not files:
-        raise InvalidFile(f"{path}: expected a folder of recordings ({', '.join(IN_FOLDERS)}), found none in it")
+        left = (
+            f": animat recover {path} makes one of what a killed run had recorded"
+            if (path / UNDER_WAY).exists()
+            else ""
+        )
+        raise InvalidFile(f"{path}: expected a folder of recordings ({', '.join(IN_FOLDERS)}), found none in it{left}")
     return files
 
 

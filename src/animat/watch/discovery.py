@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from animat.closed_loop.session import LOG_FILE
-from animat.cultures.under_way import UNDER_WAY
 from animat.errors import InvalidArgument
 from animat.execution.task import UNFINISHED
 from animat.folders import MARKERS, Kind
+from animat.recordings.formats.npz import UNDER_WAY
 from animat.writing import LOCK
 
 _MARKS = {kind: names[0] for kind, names in MARKERS.items() if kind not in ("recording", "live")}

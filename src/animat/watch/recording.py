@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from animat.cultures.under_way import UNDER_WAY
 from animat.errors import AnimatError, InvalidFile, counted
 from animat.plain_file import expect_plain_file
+from animat.recordings.formats.npz import UNDER_WAY
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
 from animat.responses.inspection import Inspection, inspect_recording

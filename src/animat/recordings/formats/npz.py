@@ -31,6 +31,8 @@ OTHER_NAMES = {
 SPREADSHEET = "[Content_Types].xml"
 """Present in the zip archives of spreadsheets."""
 ROUTING = ("mapping_electrode", "mapping_xy_um")
+UNDER_WAY = ".under-way.npz"
+"""The recording in progress, in the folder of the others; hidden, so that no reader takes it for one of them."""
 METADATA = "animat_metadata"
 """What else a recording in progress states, as JSON."""
 
