@@ -372,3 +372,13 @@ def test_recover_keeps_what_a_killed_recording_had_without_a_pulse(
     PartialRecording(live / "recordings")(lambda: virtual)
     assert main(["recover", str(live / "recordings")]) == 0
     assert "nothing to keep" in capsys.readouterr().out and not (live / "recordings" / UNDER_WAY).exists()
+
+
+@pytest.mark.parametrize(("rate_hz", "least_s"), [(10.0, 0.05), (40.0, 0.0125), (80.0, 0.01), (95.0, 0.005)])
+def test_a_stretch_ends_after_the_response_where_there_is_time(rate_hz: float, least_s: float) -> None:
+    (block,) = make_schedule(Protocol((rate_hz,), trials=200), np.arange(100)[:, None], 1).blocks
+    stretches = block.stretches(1.0, 1 / rate_hz)
+    assert len(stretches) > 1
+    since_s = [stretch.duration_s - stretch.stimuli.time_s[-1] for stretch in stretches[:-1]]
+    np.testing.assert_allclose(since_s, least_s, atol=1e-3 if rate_hz == 95.0 else 1e-4)
+    assert sum(stretch.duration_s for stretch in stretches) == pytest.approx(block.duration_s)

@@ -17,14 +17,13 @@ from animat.recordings.recorded_culture import RecordedCulture
 from animat.recordings.recording import Channels, Recording
 from animat.stimulation.frequency import distinct, is_same
 from animat.stimulation.patterns import Patterns
+from animat.stimulation.schedule import RESPONSE_S
 from animat.stimulation.stimulus import Stimulus, is_last_of
 from animat.tables import UNKNOWN
 
 NS = 1_000_000_000
 REACH_S = 1.0
 """Length of a response, unless another stimulus came sooner: longer than any response window."""
-RESPONSE_S = 0.01
-"""A pulse with less than this, the default window, before the end of its recording answers only if no other can."""
 
 
 class ReplayCulture(ComputedCulture):
@@ -145,7 +144,7 @@ class ReplayCulture(ComputedCulture):
         same = is_same(frequency_hz, stimulus.frequency_hz) | np.isnan(stimulus.frequency_hz)
         number_of, set_of_pulse = self._sets[row]
         electrodes = number_of.get(frozenset(stimulus.electrodes), UNKNOWN)
-        # A response that goes beyond the end of the recording is not known.
+        # A response that goes beyond the end of the recording is not known: it answers only if no other can.
         is_whole = stimuli.time_s + RESPONSE_S <= recording.stop_s
         for narrower in (
             ~stimuli.is_rest,

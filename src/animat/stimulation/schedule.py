@@ -17,6 +17,8 @@ from animat.tables import UNKNOWN, padded
 
 TICK_S = 50e-6
 """Stimuli start on a grid of 50 us, one sample at 20 kHz, which stimulation hardware can time exactly."""
+RESPONSE_S = 0.01
+"""After a pulse, the end of the default window."""
 SHORTEST_GAP_S = 0.005
 """Shortest gap between two pulses in which a block may be cut."""
 
@@ -35,13 +37,16 @@ class Block:
     def stretches(self, least_s: float, gap_s: float = SHORTEST_GAP_S) -> tuple[Block, ...]:
         """The block cut into consecutive stretches without set-up, of `least_s` or more but the last.
 
-        It is cut between trials, in the middle of gaps between pulses of `gap_s` or more.
+        It is cut between trials, in the middle of gaps between pulses of `gap_s` or more, or later in short ones, where
+        the response is over.
         """
         time_s, presentation = self.stimuli.time_s, self.stimuli.presentation
         # The grid of times is coarser than rounding errors.
         begins = 1 + np.flatnonzero((np.diff(presentation) != 0) & (np.diff(time_s) >= gap_s - TICK_S / 2))
         cuts = [(0, 0.0)]
-        for row, end_s in zip(begins.tolist(), on_ticks((time_s[begins - 1] + time_s[begins]) / 2), strict=True):
+        middle_s, responded_s = (time_s[begins - 1] + time_s[begins]) / 2, time_s[begins - 1] + RESPONSE_S
+        ends_s = np.where(responded_s < time_s[begins] - 1e-3, np.maximum(middle_s, responded_s), middle_s)
+        for row, end_s in zip(begins.tolist(), on_ticks(ends_s), strict=True):
             if end_s - cuts[-1][1] >= least_s:
                 cuts.append((row, float(end_s)))
         blocks = []
