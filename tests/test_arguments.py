@@ -13,6 +13,8 @@ import numpy as np
 import pytest
 
 import animat
+from animat.closed_loop.loop import Loop
+from animat.coding.encoder import Encoder
 from synthetic_recordings import synthetic_recording
 
 FUNCTIONS = [name for name in animat.__all__ if inspect.isfunction(getattr(animat, name)) and name != "paper_study"]
@@ -34,6 +36,8 @@ def test_every_public_function_names_an_argument_of_the_wrong_kind(name: str) ->
 def test_lists_and_dictionaries_are_checked_inside_and_unions_said_in_full(tmp_path: Path) -> None:
     responses = animat.extract_responses(synthetic_recording(1, patterns=3, channels=16))
     timeline = animat.fit_timeline([responses])
+    with pytest.raises(ValueError, match="read-only"):
+        timeline.start_min[0] = 5.0
     refused = {
         "robot: expected a robot, such as animat.Cartpole(), got 'cartpole'": lambda: animat.optimal_returns(
             responses,
@@ -56,6 +60,17 @@ def test_lists_and_dictionaries_are_checked_inside_and_unions_said_in_full(tmp_p
         "start_min: expected a number, or None, got '5'": lambda: animat.read_recording(
             tmp_path,
             start_min="5",  # type: ignore[arg-type]
+        ),
+        "bins: expected 1 to 10,000, got -3; only histogram simulators have bins": lambda: animat.fit_timeline(
+            [responses], bins=-3
+        ),
+        "pulses: expected at least 1, got 0": lambda: Encoder(timeline.conditions, 0),
+        "patterns: expected a whole number, or None, got 1.5": lambda: Loop(
+            animat.Cartpole(),
+            animat.Thresholds(9),
+            timeline.conditions,
+            np.arange(11.0),
+            patterns=1.5,  # type: ignore[arg-type]
         ),
         "path: expected a path, got None": lambda: animat.read_study(None),  # type: ignore[arg-type]
         "path: expected a name ending in .nwb, got r.txt": lambda: animat.write_nwb(

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float32
 from numpy.typing import ArrayLike
 
+from animat.arguments import check_argument
 from animat.coding.decoder import Decoder, expect_fit
 from animat.coding.encoder import Encoder
 from animat.coding.mapping import N_PERCENTILES, Mapping, mapping_to_data
@@ -120,6 +121,7 @@ class Loop:
                 raise InvalidArgument(f"{name}: expected a finite number from 0, got {getattr(self, name):g}")
         if self.patience_s == 0:
             raise InvalidArgument("patience_s: expected above 0 s, got 0: no answer is immediate")
+        check_argument("patterns", self.patterns, int | None)
         expect_at_least("patterns", self.patterns, 1)
 
     def _check_start(self, recorded: AdjustedRanks) -> None:

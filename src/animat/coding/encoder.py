@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from animat.arguments import checked_arguments
-from animat.errors import InvalidArgument, UnusableData, shown
+from animat.errors import InvalidArgument, UnusableData, expect_at_least, shown
 from animat.responses.condition import RESTING, Condition
 from animat.stimulation.patterns import Patterns
 from animat.stimulation.stimulus import NOTHING
@@ -39,6 +39,7 @@ class Encoder:
     def __post_init__(self) -> None:
         if not self.conditions:
             raise InvalidArgument("conditions: expected at least one, got none")
+        expect_at_least("pulses", self.pulses, 1)
         for condition in self.conditions:
             expected = f"condition {condition.label}: expected recordings that state the"
             if not condition.frequencies_hz:

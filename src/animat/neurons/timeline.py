@@ -25,6 +25,7 @@ from animat.neurons.simulator import (
     HistogramSimulator,
     JointHistogramSimulator,
     NeuronSimulator,
+    check_binning,
     fit_empirical,
     fit_histogram,
     fit_joint_histogram,
@@ -39,7 +40,7 @@ from animat.responses.quality.one_culture import series_findings, series_mismatc
 from animat.responses.readouts import ALL, Readouts
 from animat.responses.responses import Responses
 from animat.stimulation.protocol import Presentation
-from animat.tables import briefly
+from animat.tables import briefly, read_only
 from animat.writing import write_whole
 
 Kind = Literal["histogram", "empirical", "memory"]
@@ -95,6 +96,9 @@ class SimulatorTimeline:
     responses: tuple[Responses, ...] = ()
     readouts: Readouts = ALL
     culture: RecordedCulture | None = None
+
+    def __post_init__(self) -> None:
+        read_only(self, "start_min", np.float64)
 
     def __len__(self) -> int:
         return len(self.start_min)
@@ -171,6 +175,7 @@ def fit_timeline(
     if not ordered:
         raise InvalidArgument("series: expected the responses of at least one recording, got none")
     first = ordered[0]
+    check_binning(bins, range_hz)
     kind = kind or default_kind(first)
     if mismatch := series_mismatch(ordered):
         raise Mismatch(mismatch)
