@@ -428,7 +428,7 @@ def test_an_agent_may_have_begin_alone(tmp_path: Path) -> None:
         evaluate(policies, timeline, episodes=5, controls=[], agents={"": Plain()})
 
 
-def test_ctrl_c_ends_an_evaluation_whose_agent_hangs() -> None:
+def test_ctrl_c_ends_an_evaluation_whose_agent_hangs(in_the_foreground: None) -> None:
     released = threading.Event()
 
     class Hangs:

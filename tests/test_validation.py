@@ -25,7 +25,16 @@ from animat.cultures.virtual import VirtualCulture
 from animat.errors import InvalidArgument, UnusableData
 from animat.neurons.history import NO_MEMORY, Memory, Ranked
 from animat.neurons.memory import MemorySimulator, fit_memory
-from animat.neurons.prediction import LAGS, autocorrelation, free_runs, halved, predict, run_lengths, shares_lasting
+from animat.neurons.prediction import (
+    LAGS,
+    autocorrelation,
+    free_runs,
+    halved,
+    predict,
+    run_lengths,
+    share_below,
+    shares_lasting,
+)
 from animat.neurons.timeline import fit_simulator
 from animat.neurons.validation import MARGINAL, Validation, correlations, validate
 from animat.recordings.reading import read_recording
@@ -154,6 +163,28 @@ def test_chance_alone_makes_distances_of_ranks_within_conditions() -> None:
     ours, theirs = np.array(p_values).T
     assert np.abs(ours - theirs).max() < 0.1
     assert ours.min() > 0
+
+
+@pytest.mark.oracle
+def test_where_nothing_changed_p_values_are_as_often_small_as_they_should_be_with_ties_too() -> None:
+    small = []
+    for seed in range(60):
+        x = np.random.default_rng(seed).poisson(2, 400).astype(float)
+        p_value = validate(series(x, np.arange(400) % 2, 2)).of("empirical").p_value
+        assert p_value is not None
+        small.append(p_value <= 0.3)
+    # Of 60, 18 with a standard deviation of 3.5; as if responses were never tied, 3.
+    assert 8 <= sum(small) <= 28
+
+
+def test_shares_below_are_those_of_the_formula() -> None:
+    rng = np.random.default_rng(0)
+    low = rng.integers(0, 20, 300) / 20
+    transforms = np.stack([low, low + rng.integers(0, 3, 300) / 20], axis=1)
+    at = np.linspace(0, 1, 101) + 1e-4
+    width = np.maximum(transforms[:, 1] - low, 1e-12)
+    expected = np.clip((at[:, None] - low) / width, 0, 1).mean(axis=1)
+    np.testing.assert_allclose(share_below(transforms, at), expected, atol=1e-9)
 
 
 # --- what decides ---------------------------------------------------------------------------------------------------

@@ -187,9 +187,25 @@ def share_below(
 
     Source: the non-randomised transform of Czado, Gneiting and Held 2009, doi:10.1111/j.1541-0420.2009.01191.x.
     """
-    low, high = transforms.T[:, :, None]
-    within = (at - low) / np.maximum(high - low, 1e-12)
-    return np.asarray(np.clip(within, 0.0, 1.0).mean(axis=0))
+    low, high = transforms.T
+    is_spread = high - low > 1e-12
+    low, high, points = low[is_spread], high[is_spread], np.sort(low[~is_spread])
+    density = 1 / (high - low)
+    # A share that rises from F(x-) to F(x) is the difference of two that rise from there on for ever.
+    rising = _rising(low, density, at) - _rising(high, density, at)
+    # 1e-12: shares are rounded, and what is at a place is not below it.
+    return np.asarray((rising + np.searchsorted(points, at - 1e-12)) / len(transforms))
+
+
+def _rising(
+    since: Float64[np.ndarray, " n"], density: Float64[np.ndarray, " n"], at: Float64[np.ndarray, " places"]
+) -> Float64[np.ndarray, " places"]:
+    """The sum of density (at - since) over those that have begun."""
+    order = np.argsort(since)
+    sums = (np.concatenate([[0.0], np.cumsum(each[order])]) for each in (density, density * since))
+    begun = np.searchsorted(since[order], at)
+    slope, offset = (each[begun] for each in sums)
+    return np.asarray(at * slope - offset)
 
 
 def recorded_series(halves: Halves) -> Float64[np.ndarray, " presentations"]:

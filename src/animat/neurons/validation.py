@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float32, Float64
 
 from animat.arguments import checked_arguments
 from animat.errors import InvalidArgument
@@ -310,18 +310,29 @@ def _chance_levels(
 ) -> tuple[Float64[np.ndarray, " chances"], tuple[float, float]]:
     """Distances from uniform, and the middle 95 % of the bins' shares, if both halves have the same distributions.
 
-    They are simulated with independent uniform responses, as many per condition and half as recorded: only the ranks of
-    the second half's among the first's count, so any continuous distribution gives the same.
+    The recorded responses to each condition are shuffled between the halves, so that as many are tied as were recorded.
     """
-    n = [(len(halves.first_of(c)), np.count_nonzero(halves.condition == c)) for c in np.unique(halves.condition)]
+    conditions = np.unique(halves.condition)
+    parts = [(halves.first_of(c).astype(np.float32), halves.x_hz[halves.condition == c]) for c in conditions]
     distances, shares = [], []
     for _ in range(_CHANCES):
-        x = np.sort(np.concatenate([np.searchsorted(np.sort(rng.random(a)), rng.random(b)) / a for a, b in n]))
-        below = np.arange(len(x) + 1) / len(x)
-        distances.append(max((below[1:] - x).max(), (x - below[:-1]).max()))
-        shares.append(np.histogram(x, PIT_BINS, (0, 1))[0] / len(x))
+        transforms = np.concatenate([_shuffled(*of_condition, rng) for of_condition in parts])
+        # At both sides of every step: not smaller than to 0.001.
+        at = np.unique(transforms)
+        distances.append(max(np.abs(share_below(transforms, at + side) - at).max() for side in (0.0, 1e-11)))
+        shares.append(pit_shares(transforms))
     low, high = np.quantile(shares, [0.025, 0.975])
     return np.array(distances), (float(low), float(high))
+
+
+def _shuffled(
+    first: Float32[np.ndarray, " fitted"], second: Float32[np.ndarray, " held"], rng: np.random.Generator
+) -> Float64[np.ndarray, "held 2"]:
+    """The transforms of a second half by the distribution of the first, the responses shuffled between them."""
+    shuffled = rng.permutation(np.concatenate([first, second]))
+    fitted, held = np.sort(shuffled[: len(first)]), shuffled[len(first) :]
+    below, up_to = (np.searchsorted(fitted, held, side) / len(fitted) for side in ("left", "right"))
+    return np.stack([below, up_to], axis=1)
 
 
 def _plain(value: Any) -> Any:
