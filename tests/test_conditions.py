@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -21,7 +20,7 @@ from animat.responses.conditions import (
     conditions_named,
     default_conditions,
 )
-from animat.stimulation.stimulus import NOTHING, Stimuli
+from animat.stimulation.stimulus import Stimuli
 
 
 def stimuli(
@@ -75,12 +74,6 @@ def test_frequencies_computed_from_intervals_are_one_condition() -> None:
 def test_the_interval_is_the_one_before() -> None:
     # Gaps 0.2 s (5 Hz), 0.1 s (10 Hz), 1 s (neither); the first pulse has none.
     assert assigned(ByInterval((5, 10)), stimuli([0, 0.2, 0.3, 1.3])) == ([-1, 0, 1, -1], ["5 Hz", "10 Hz"])
-
-
-def test_a_rest_is_no_pulse_before() -> None:
-    table = replace(stimuli([0, 0.1, 0.2, 0.25, 0.3]), pattern=np.array([0, NOTHING, 0, NOTHING, 0]))
-    assert table.is_rest.tolist() == [False, True, False, True, False]
-    assert assigned(ByInterval((5, 10)), table)[0] == [-1, -1, 0, -1, 1]
 
 
 def test_the_tolerance_is_a_ratio() -> None:

@@ -837,8 +837,7 @@ COMPARED = (
         ("[robots.cartpole]\niterations = 3", "robots: expected [[robots]] for each, and its name in it, got [robots."),
         ("[[arms]]\nname = 'a/b'", "arms.name: expected letters"),
         ("[[arms]]\nname = '10'", "which would be read as a number in a table"),
-        ("[[arms]]\nname = 'NA'", "which would not be read as text in a table"),
-        ("[[arms]]\nname = 'True'", "which would not be read as text in a table"),
+        ("[[arms]]\nname = 'NA'", "which would be read as missing in a table"),
         (
             "[[arms]]\nname = 'a'\n[[arms]]\nname = 'A'",
             "expected each name once, got 'a' 2 times: capitals, and spaces for dashes, make no difference",

@@ -235,9 +235,8 @@ def _start_s(made: Mapping[int, Path], culture: Culture, protocol: Protocol, int
         since_s = culture.now_s - 60 * recording.start_min
         if since_s < recording.duration_s:
             ended_min = recording.start_min + recording.duration_s / 60
-            at = f"{culture.now_s / 60:.2f} min, got one that ended at {ended_min:.2f} min"
-            got = f"which is at {at}: it was restarted, or is another's"
-            raise _another(file, f"that ended before the culture's clock, {got}")
+            at = f"{culture.now_s / 60:.2f} min, got one at {recording.start_min:.2f} min, to {ended_min:.2f} min"
+            raise _another(file, f"before the culture's clock, which is at {at}: it was restarted, or is another's")
         if culture.device is not None and recording.recorded_at is not None:
             passed_s = (datetime.now(UTC) - recording.recorded_at).total_seconds()
             if passed_s > since_s + 60 * RESTARTED_MIN:

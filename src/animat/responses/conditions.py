@@ -99,16 +99,16 @@ class ByInterval(Conditions):
         return f"interval{_listed(self.values_hz)}+-{100 * self.tolerance:.10g}%"
 
     def assign(self, stimuli: Stimuli) -> Assignment:
-        """Sort pulses by the nearest frequency within the tolerance; others, and rests, have no condition."""
-        index, pulses = np.full(len(stimuli), NO_CONDITION), np.flatnonzero(~stimuli.is_rest)
-        interval_s = np.diff(stimuli.time_s[pulses])
+        """Sort pulses by the nearest frequency within the tolerance; others have no condition."""
+        index = np.full(len(stimuli), NO_CONDITION)
+        interval_s = np.diff(stimuli.time_s)
         if len(interval_s):
             with np.errstate(divide="ignore"):
                 distance = np.abs(np.log(interval_s[:, None] * np.array(self.values_hz)))
             nearest = np.argmin(distance, axis=1)
             # 1e-9: times are rounded, so chance would decide about an interval on the edge.
             within = distance.min(axis=1) <= math.log1p(self.tolerance) + 1e-9
-            index[pulses[1:][within]] = nearest[within]
+            index[1:][within] = nearest[within]
         return Assignment(index, tuple(map(_frequency, self.values_hz)))
 
 

@@ -29,8 +29,8 @@ FINEST_RESOLUTION = 2.0
 """Of the optimal return's grid: the cartpole's tables take 2 GiB there, and grow with its fourth power."""
 
 
-_NO_NAMES = ("na", "null", "none", "true", "false")
-"""In small letters, what programs that read tables take for something else than text."""
+_NO_NAMES = ("na", "null", "none")
+"""In small letters, what programs that read tables take for a missing value."""
 
 
 def _check_name(name: str) -> str:
@@ -40,7 +40,7 @@ def _check_name(name: str) -> str:
         float(name)
     except ValueError:
         if name.lower() in _NO_NAMES:
-            raise ValueError(f"expected a name, got {name!r}, which would not be read as text in a table") from None
+            raise ValueError(f"expected a name, got {name!r}, which would be read as missing in a table") from None
         return name
     raise ValueError(f"expected a name, got {name!r}, which would be read as a number in a table")
 
