@@ -308,7 +308,7 @@ def test_a_blank_is_a_straight_line_between_its_sides() -> None:
 
 
 @pytest.mark.parametrize("amplitude", [1.0, 2.0, 5.0])
-@pytest.mark.parametrize("step_uv", [0.195, 6.3, 12.6])
+@pytest.mark.parametrize("step_uv", [6.3, *(pytest.param(each, marks=pytest.mark.oracle) for each in (0.195, 12.6))])
 def test_the_negative_peak_of_a_spike_in_coarse_steps_is_no_saturation(amplitude: float, step_uv: float) -> None:
     rng = np.random.default_rng(5)
     pulses = np.arange(1000, 39_000, 1000)
@@ -403,7 +403,7 @@ def test_who_is_saturated_for_long_is_blanked_to_its_end(until_ms: float, chunk_
 
 
 @pytest.mark.parametrize("chunk_s", [0.5, 20.0])
-@pytest.mark.parametrize("from_s", [1.03, 1.14, 1.25])
+@pytest.mark.parametrize("from_s", [1.14, *(pytest.param(each, marks=pytest.mark.oracle) for each in (1.03, 1.25))])
 def test_who_is_saturated_over_several_pulses_is_blanked_wherever_pieces_begin(from_s: float, chunk_s: float) -> None:
     voltage, truth = noisy(4, 20.0)
     pulses = np.arange(from_s, 19.0, 0.05)

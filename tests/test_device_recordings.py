@@ -72,7 +72,7 @@ def fail_at(n: int, error: BaseException, kind: type[Culture], patch: pytest.Mon
 
 
 @pytest.mark.parametrize("device", [on_cl1, on_maxone])
-@pytest.mark.parametrize("between_s", [0.0, 0.03, 0.2])
+@pytest.mark.parametrize("between_s", [0.03, *(pytest.param(each, marks=pytest.mark.oracle) for each in (0.0, 0.2))])
 def test_a_long_block_is_recorded_in_stretches_and_the_clock_keeps_count(
     device: Callable, between_s: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -114,7 +114,9 @@ def test_a_long_block_is_recorded_in_stretches_and_the_clock_keeps_count(
 
 
 @pytest.mark.parametrize("device", [on_cl1, on_maxone])
-@pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError("a broken cable")])
+@pytest.mark.parametrize(
+    "error", [KeyboardInterrupt, pytest.param(RuntimeError("a broken cable"), marks=pytest.mark.oracle)]
+)
 def test_what_was_recorded_before_an_error_is_kept(
     device: Callable, error: BaseException, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

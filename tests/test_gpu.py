@@ -152,6 +152,7 @@ class Elsewhere(TrainingTask):
         return TrainingWork(self.group, folder / self.name, folder / "none.npz")
 
 
+@pytest.mark.oracle
 def test_tasks_of_one_program_are_done_at_once_and_the_others_on_cores(at_once: AtOnce, tmp_path: Path) -> None:
     # Places of their own, as those of two trainings have.
     first, second = (Elsewhere(arm.percentiles, group_of(arm, 0, 1)) for arm in ARMS)

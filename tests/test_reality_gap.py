@@ -739,7 +739,13 @@ CURRENT = Pulse((Phase(160.0, amplitude_ua=-1.0), Phase(160.0, amplitude_ua=1.0)
 
 
 @pytest.mark.usefixtures("few_bootstraps")
-@pytest.mark.parametrize("case", ["recorded", "given", "unknown", "session", "replay", "replay of current"])
+@pytest.mark.parametrize(
+    "case",
+    [
+        *("recorded", "given", "replay of current"),
+        *(pytest.param(case, marks=pytest.mark.oracle) for case in ("unknown", "session", "replay")),
+    ],
+)
 def test_a_loop_delivers_what_its_recording_was_made_with(
     case: str, tmp_path: Path, recordings: list[Recording], series: list[Responses]
 ) -> None:

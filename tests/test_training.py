@@ -71,6 +71,7 @@ class Kept:
         self.updates.append((done, total))
 
 
+@pytest.mark.oracle
 def test_the_same_seed_gives_the_same_bits_in_workers_and_on_an_executor_which_stays_open(tmp_path: Path) -> None:
     four = replace(SHORT, policies=4, iterations=1_000)
     progress = Kept()
