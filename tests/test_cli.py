@@ -264,6 +264,16 @@ def test_evaluate_writes_over_no_file_but_an_evaluation(
         assert (tmp_path / name).read_bytes() == content
 
 
+def test_a_training_that_is_no_better_than_random_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    train = ["train", "cartpole", "--mapping", "none", "--policies", "1", "--iterations", "480"]
+    assert main([*train, "--out", str(tmp_path / "out"), "--json"]) == 0
+    said = capsys.readouterr()
+    results: Any = last_json(said.out)
+    named = [each["name"] for each in results["findings"]]
+    assert results["returns"]["p0"] < results["random"] and named == ["no-better-than-random"]
+    assert "the policies are no better than random actions (" in said.err and "animat validate" not in said.err
+
+
 def test_policies_of_a_training_that_is_not_finished_are_counted(
     recordings: Path, policies: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

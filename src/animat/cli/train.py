@@ -13,12 +13,12 @@ from tyro.conf import Positional
 
 from animat.cli.command import JobOptions, SimulatorOptions, print_warnings, read_numbers, read_sac
 from animat.errors import InvalidArgument, UnusableData, counted, expect_at_least, in_file, in_min
+from animat.recordings.findings import Finding
 from animat.records import as_json
 from animat.writing import expect_writable
 
 if TYPE_CHECKING:
     from animat.neurons.timeline import SimulatorTimeline
-    from animat.recordings.findings import Finding
     from animat.responses.readouts import Readouts
     from animat.training.policy import Policy
     from animat.training.specification import Training
@@ -194,6 +194,14 @@ class Train(SimulatorOptions, JobOptions):
         evaluation = evaluate(trained, timeline, at_min=until, controls=("random",))
         print_warnings(evaluation.findings)
         policies, control = (row.to_dict() for row in evaluation.rows)
+        of = "net_return" if self.pulse_cost else "mean_return"
+        if self.delivery == "chosen" and policies[of] <= control[of]:
+            means = f"{policies[of]:.1f} against {control[of]:.1f}"
+            steer = "" if timeline is None else ", or see whether the culture can be steered (animat validate)"
+            remedy = f"train longer (--iterations){steer}"
+            message = f"the policies are no better than random actions ({means}): {remedy}"
+            findings += (Finding("no-better-than-random", "warning", message),)
+            print_warnings(findings[-1:])
         on = "" if evaluation.recorded_at_min is None else f" on the simulator at {in_min(evaluation.recorded_at_min)}"
         error = "" if policies["standard_error"] is None else f" (standard error {policies['standard_error']:.1f})"
         mean, at_random = f"{policies['mean_return']:.1f}{error}", f"{control['mean_return']:.1f}"
