@@ -26,7 +26,12 @@ from dataclasses import dataclass
 from typing import NamedTuple
 import animat
 
-SIGN = 1.0
+if len(animat.__name__) > 1:
+    SIGN = 1.0
+
+    def far(x_m):
+        return jnp.abs(x_m) > 1
+
 OTHER = 2.0
 
 
@@ -55,7 +60,7 @@ class Rover(animat.Robot[At]):
     def advance(self, uniforms, state, u):
         # Ends far away.
         x_m = state.x_m + 0.1 * u
-        return At(x_m), reward(x_m), jnp.abs(x_m) > 1
+        return At(x_m), reward(x_m), far(x_m)
 
     def observe(self, state):
         return jnp.stack([state.x_m])
@@ -97,6 +102,7 @@ def rover(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
         ("SIGN = 1.0", "SIGN = -1.0", False),
         ("return SIGN * jnp.abs(x_m)", "return SIGN * x_m", False),
         ("0.1 * u", "0.2 * u", False),
+        ("jnp.abs(x_m) > 1", "jnp.abs(x_m) > 2", False),
         ("import jax.numpy as jnp", "import numpy as jnp", False),
     ],
 )

@@ -154,8 +154,8 @@ class Culture(Openable):
                 try:
                     observed = self._deliver(admitted, duration_s)
                 except BaseException:
-                    if self.device is None:
-                        # What was to come does not come.
+                    if isinstance(self, ComputedCulture):
+                        # What was to come does not come; a device may still deliver it.
                         guard.interrupt(self.now_s)
                     raise
                 return with_rests(observed, stimuli, now_s)

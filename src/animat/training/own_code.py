@@ -12,6 +12,9 @@ from typing import Any
 from animat.registry import is_ours
 
 
+_DEFINITIONS = ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef
+
+
 def code_of(thing: Any) -> dict[str, str]:
     """A fingerprint of the code of a robot or a mapping, by its name; empty for one of animat's own.
 
@@ -45,12 +48,18 @@ def _used_by(name: str, module: ast.Module) -> list[ast.stmt]:
 
 
 def _defined_in(statement: ast.stmt) -> set[str]:
-    if isinstance(statement, ast.Import | ast.ImportFrom):
-        return {(alias.asname or alias.name).partition(".")[0] for alias in statement.names}
-    own = {statement.name} if isinstance(statement, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef) else set()
-    if own:
-        return own
-    return {node.id for node in ast.walk(statement) if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)}
+    """The names that a statement of a module defines, also within `if` and `try`."""
+    if isinstance(statement, _DEFINITIONS):
+        return {statement.name}
+    names = set()
+    for node in ast.walk(statement):
+        if isinstance(node, _DEFINITIONS):
+            names.add(node.name)
+        elif isinstance(node, ast.Import | ast.ImportFrom):
+            names |= {(alias.asname or alias.name).partition(".")[0] for alias in node.names}
+        elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+            names.add(node.id)
+    return names
 
 
 class _Plain(ast.NodeTransformer):
