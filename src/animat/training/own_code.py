@@ -11,7 +11,6 @@ from typing import Any
 
 from animat.registry import is_ours
 
-
 _DEFINITIONS = ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef
 
 
