@@ -15,8 +15,8 @@ from animat.columns import align_columns
 
 @dataclass(frozen=True)
 class Recover(Command):
-    """Write the recording of a closed-loop session that was killed, from its log, or what a killed recording of a
-    device had recorded"""
+    """Write the recording of a closed-loop session that was killed, from its log; or keep what a device had recorded
+    when animat record or animat live was killed."""
 
     session: Positional[Path] = Path("session")
     """The session's folder, or one of recordings"""
