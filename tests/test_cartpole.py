@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from animat.robots import Cartpole, CartpoleState
 
@@ -203,3 +204,12 @@ def test_a_pole_left_alone_falls_and_a_simple_rule_keeps_it_up() -> None:
     assert alive.all() and np.all(total == 120)
     alive, total = jax.vmap(lambda key: episode(key, lambda state: jnp.float32(1)))(keys)
     assert not alive.any() and np.all(total < -80)
+
+
+def test_an_episode_that_fails_in_its_last_iteration_is_not_drawn_as_one_to_the_end() -> None:
+    robot = Cartpole()
+    stays, falls, leaves = np.zeros((3, robot.episode_limit + 1, 4))
+    falls[-1, 2], leaves[-1, 0] = 1.01 * robot.angle_limit_rad, 0.51
+    axes = Figure().subplots()
+    robot.draw_paths(axes, [stays, falls, leaves, stays[:50]])
+    assert axes.get_xlabel() == "time (s); 1 of 4 to the end"

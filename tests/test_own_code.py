@@ -68,6 +68,11 @@ class Rover(animat.Robot[At]):
 
 def unused():
     return 1
+
+
+Rover.friction = 0.5
+if __name__ == "__main__":
+    SIGN = 7
 '''
 
 
@@ -98,6 +103,9 @@ def rover(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
         ("# Ends far away.", "# Ends.", True),
         ('"""Moves by the command."""', '"""Moves."""', True),
         ("return 1", "return 2", True),
+        ("    def observe(self, state):", '    def observe(self, state):\n        """New."""', True),
+        ("SIGN = 7", "SIGN = 8", True),
+        ("Rover.friction = 0.5", "Rover.friction = 0.6", False),
         ("OTHER = 2.0", "OTHER = 3.0", True),
         ("SIGN = 1.0", "SIGN = -1.0", False),
         ("return SIGN * jnp.abs(x_m)", "return SIGN * x_m", False),

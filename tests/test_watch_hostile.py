@@ -6,12 +6,14 @@ import io
 import json
 import math
 import os
+import re
 import struct
 import subprocess
 import sys
 import zlib
 from pathlib import Path
 from random import Random
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -29,6 +31,7 @@ from animat.watch.study import StudyView
 from animat.watch.training import TrainingView
 from animat.watch.tuning import TuningView
 from animat.watch.view import View
+from animat.writing import exclusive_lock
 from watching import session_in
 
 HOSTILE = (
@@ -259,3 +262,18 @@ def test_a_study_that_names_code_imports_none_of_it(tmp_path: Path) -> None:
     (tmp_path / "study.toml").write_text('[[robots]]\nname = "mine"\nkind = "not_to_be_imported:Rover"\n')
     StudyView(tmp_path).view(None, 8.0)
     assert "not_to_be_imported" not in sys.modules
+
+
+def test_the_time_left_for_trials_that_end_many_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ten in ten minutes, of forty: after twenty, half an hour at the most."""
+    now_s = [0.0]
+    monkeypatch.setattr("animat.progress.time", SimpleNamespace(monotonic=lambda: now_s[0]))
+    (tmp_path / "tune.json").write_text(json.dumps({**TUNING, "tune": {"trials": 40}}))
+    trials = [json.dumps({**TRIAL, "trial": number}) + "\n" for number in range(20)]
+    with exclusive_lock(tmp_path):
+        view, left = TuningView(tmp_path), ""
+        for second in range(0, 1500, 5):
+            now_s[0] = float(second)
+            (tmp_path / "journal.jsonl").write_text("".join(trials[: second // 600 * 10]))
+            left = dict(view.view(None, 8.0)["blocks"][0]["rows"])["time left for the trials"]
+    assert re.fullmatch(r"1\d min|2\d min", left), left

@@ -188,7 +188,8 @@ def share_below(
     Source: the non-randomised transform of Czado, Gneiting and Held 2009, doi:10.1111/j.1541-0420.2009.01191.x.
     """
     low, high = transforms.T
-    is_spread = high - low > 1e-12
+    # The difference below would not be exact for those that are hardly spread.
+    is_spread = high - low > 1e-6
     low, high, points = low[is_spread], high[is_spread], np.sort(low[~is_spread])
     density = 1 / (high - low)
     # A share that rises from F(x-) to F(x) is the difference of two that rise from there on for ever.

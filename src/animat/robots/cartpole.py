@@ -234,7 +234,11 @@ class Cartpole(Robot[CartpoleState]):
     def draw_paths(self, axes: Axes, paths: Sequence[np.ndarray]) -> None:
         """The pole's angle over time in each episode."""
         limit_deg, angles_deg = math.degrees(self.angle_limit_rad), [np.degrees(path[:, 2]) for path in paths]
-        stayed, limits = [len(path) > self.episode_limit for path in paths], (-limit_deg, limit_deg)
+        ends = [(abs(float(path[-1, 0])), abs(float(path[-1, 2]))) for path in paths]
+        has_failed = [x > self.track_length_m / 2 or angle > self.angle_limit_rad for x, angle in ends]
+        # It may fail in the last iteration, too.
+        stayed = [len(path) > self.episode_limit and not fails for path, fails in zip(paths, has_failed, strict=True)]
+        limits = -limit_deg, limit_deg
         draw_over_time(axes, self, angles_deg, stayed, limits=limits, success="to the end")
         axes.set(ylabel="pole angle (deg)", ylim=(-1.25 * limit_deg, 1.25 * limit_deg))
 

@@ -34,7 +34,8 @@ def code_of(thing: Any) -> dict[str, str]:
 
 def _used_by(name: str, module: ast.Module) -> list[ast.stmt]:
     """The statements of a module that define a name, and all that these use, in their order."""
-    defines = [(statement, _defined_in(statement)) for statement in map(_Plain().visit, module.body)]
+    statements = (_Plain().visit(statement) for statement in module.body if not _is_main(statement))
+    defines = [(statement, _defined_in(statement)) for statement in statements if statement is not None]
     wanted, used = [name], {name}
     while wanted:
         current = wanted.pop()
@@ -56,13 +57,22 @@ def _defined_in(statement: ast.stmt) -> set[str]:
             names.add(node.name)
         elif isinstance(node, ast.Import | ast.ImportFrom):
             names |= {(alias.asname or alias.name).partition(".")[0] for alias in node.names}
-        elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
-            names.add(node.id)
+        elif isinstance(node, ast.Name | ast.Attribute | ast.Subscript) and isinstance(node.ctx, ast.Store):
+            # Of Rover.gain = 2 it is the rover that is changed.
+            whole: ast.expr = node
+            while isinstance(whole, ast.Attribute | ast.Subscript):
+                whole = whole.value
+            names |= {whole.id} if isinstance(whole, ast.Name) else set()
     return names
+
+
+def _is_main(statement: ast.stmt) -> bool:
+    """Whether it runs only where the module is the program: `if __name__ == "__main__":`."""
+    return isinstance(statement, ast.If) and ast.unparse(statement.test).startswith("__name__ ==")
 
 
 class _Plain(ast.NodeTransformer):
     """Removes docstrings, and other text that nothing uses."""
 
-    def visit_Expr(self, node: ast.Expr) -> ast.AST:
-        return ast.Pass() if isinstance(node.value, ast.Constant) else node
+    def visit_Expr(self, node: ast.Expr) -> ast.AST | None:
+        return None if isinstance(node.value, ast.Constant) else node

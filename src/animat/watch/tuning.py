@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import itertools
 import json
+from pathlib import Path
 from statistics import fmean
 from typing import Any
 
 from animat.errors import InvalidFile
+from animat.progress import Speed
 from animat.watch.discovery import state_of
 from animat.watch.files import json_of, listed, mapped, number, text, text_of
 from animat.watch.study import running_jobs, running_table
@@ -19,6 +21,11 @@ _STATES = {"complete": "complete", "stopped": "stopped early", "diverged": "dive
 
 class TuningView(View):
     kind = "tuning"
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder)
+        # Trials end many at a time, and far apart.
+        self._speed = Speed()
 
     def _title(self) -> str:
         robots = ", ".join(text(spec["name"]) for spec in self._manifest()["study"]["robots"])
