@@ -27,7 +27,7 @@ def code_of(thing: Any) -> dict[str, str]:
     with suppress(OSError, ValueError, SyntaxError):
         parts = _used_by(kind.__qualname__.partition(".")[0], ast.parse(Path(file).read_bytes()))
         if parts:
-            digest = hashlib.sha256("\n".join(map(ast.unparse, parts)).encode()).hexdigest()
+            digest = hashlib.sha256(repr(_shape(parts)).encode()).hexdigest()
             return {f"code of {thing.name}": f"sha256 {digest[:16]}"}
     return {}
 
@@ -69,6 +69,16 @@ def _defined_in(statement: ast.stmt) -> set[str]:
 def _is_main(statement: ast.stmt) -> bool:
     """Whether it runs only where the module is the program: `if __name__ == "__main__":`."""
     return isinstance(statement, ast.If) and ast.unparse(statement.test).startswith("__name__ ==")
+
+
+def _shape(node: Any) -> Any:
+    """A syntax tree as nested tuples that are the same in every version of Python: without fields that are empty."""
+    if isinstance(node, list):
+        return tuple(map(_shape, node))
+    if not isinstance(node, ast.AST):
+        return node
+    known = ((name, value) for name, value in ast.iter_fields(node) if value not in (None, []))
+    return type(node).__name__, *((name, _shape(value)) for name, value in known)
 
 
 class _Plain(ast.NodeTransformer):
