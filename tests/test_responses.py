@@ -19,8 +19,9 @@ from animat.responses.extraction import extract_responses
 from animat.responses.inspection import inspect_recording
 from animat.responses.psth import find_response, post_stimulus_histogram, spontaneous_rate
 from animat.responses.responses import Responses
-from animat.stimulation.protocol import Presentation
+from animat.stimulation.protocol import Presentation, Protocol
 from animat.stimulation.stimulus import NOTHING, Stimuli
+from fake_culture import FakeCulture
 from synthetic_recordings import synthetic_recording
 
 
@@ -410,3 +411,22 @@ def test_conditions_that_a_recording_lacks_cannot_be_chosen(conditions: list[int
     source = recording([(1.005, 0)], times, frequency_hz=np.tile([5.0, 10.0], 20))
     with pytest.raises(InvalidArgument, match="conditions: expected some of 0 to 1, each once, got"):
         extract_responses(source, burst_threshold=1.0).only(conditions)
+
+
+@pytest.mark.parametrize(("pause_s", "tail_s", "setup_s"), [(0.5, 0.1, 14.0), (0.5, 0.005, 14.0), (0.2, 0.1, 0.3)])
+def test_the_set_up_between_blocks_which_the_clock_leaves_out_is_a_silence(
+    pause_s: float, tail_s: float, setup_s: float
+) -> None:
+    protocol = Protocol((10.0, 20.0, 40.0), patterns=4, trials=8, setup_s=setup_s, pause_s=pause_s, tail_s=tail_s)
+    with FakeCulture() as culture:
+        recording = culture.record(protocol, 1)
+    found = extract_responses(recording, burst_threshold=1.0)
+    first_hz = recording.stimuli.frequency_hz[[0, 8, 16]]
+    silent_s = setup_s + pause_s + 1 / first_hz + tail_s
+    rested = [0, *(row for row, gap_s in zip((8, 16), silent_s[1:], strict=True) if gap_s > 1.05)]
+    # The windows of the last trials are cut off, if the tail is shorter.
+    read = [row for row in range(24) if tail_s > 0.01 or row % 8 < 7]
+    assert found.time_s is not None and found.time_s.tolist() == recording.stimuli.time_s[read].tolist()
+    assert np.asarray(read)[found.presentations[0].is_rested].tolist() == rested
+    left_out = [f.message for f in found.findings if f.name == "window-past-end"]
+    assert (len(left_out) == 1) == (tail_s < 0.01) and all("3 of 24" in each for each in left_out)

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
+from jaxtyping import Bool, Float64
 
 from animat.arguments import checked_arguments
 from animat.errors import InvalidArgument, Mismatch, UnusableData, did_you_mean, in_min
@@ -91,6 +92,7 @@ def extract_responses(
     assignment = _without_rests(by.assign(stimuli), stimuli)
     # Trials without a condition are read too, as the history of others.
     read, inside = stimuli.is_last_of_presentation, None
+    begins, setup_s = _blocks(source)
     assumed: tuple[Finding, ...] = ()
     if isinstance(source, ResponseTable):
         window_ms, assumed = _window_of(source, by, window_ms)
@@ -100,7 +102,7 @@ def extract_responses(
         active_ratio = np.mean(source.values[presented] > 0, axis=1)
     else:
         # An end that equals the time of the last stimulus or spike is rounded as that is.
-        inside = stimuli.time_s + window_ms[1] * 1e-3 <= source.stop_s + 1e-9
+        inside = stimuli.time_s + window_ms[1] * 1e-3 <= _observed_until_s(source, begins) + 1e-9
         presented, has_times = np.flatnonzero(read & inside), True
         rate_hz, active_ratio = read_windows(source, stimuli.time_s[presented], window_ms)
     condition = assignment.condition[presented]
@@ -108,7 +110,8 @@ def extract_responses(
     bursts = separate_bursts(active_ratio[chosen], burst_threshold, n_channels=n_channels)
     # There is no silence within a trial, however long it lasts. Rows without times are taken as successive, and nothing
     # is known about what came before the first.
-    silences = np.cumsum(np.diff(stimuli.time_s, prepend=-np.inf) > SILENCE_S)
+    since_s = np.diff(stimuli.time_s, prepend=-np.inf) + begins * setup_s
+    silences = np.cumsum(since_s > SILENCE_S)
     is_rested = (np.diff(silences[presented], prepend=0) > 0) & has_times
     time_s = stimuli.time_s[presented] if has_times else None
     readout_hz = None
@@ -145,6 +148,24 @@ def extract_responses(
         recording=source.without_spikes() if isinstance(source, Recording) else None,
     )
     return replace(responses, findings=(*assumed, *findings_on(responses, source, assignment, bursts, inside)))
+
+
+def _blocks(source: Recording | ResponseTable) -> tuple[Bool[np.ndarray, " stimuli"], float]:
+    """Whether a block begins with each stimulus, and the set-up before a block, which the recording's clock leaves out."""
+    protocol, stimuli = source.protocol if isinstance(source, Recording) else None, source.stimuli
+    if protocol is None or protocol.order != "blocked":
+        return np.zeros(len(stimuli), bool), 0.0
+    trial = np.cumsum(np.diff(stimuli.presentation, prepend=-2) != 0) - 1
+    return np.diff(trial // protocol.trials, prepend=-1) != 0, protocol.setup_s
+
+
+def _observed_until_s(recording: Recording, begins: Bool[np.ndarray, " stimuli"]) -> Float64[np.ndarray, " stimuli"]:
+    """How long what follows each stimulus was observed: to the end of the recording, or of its block."""
+    until_s = np.full(len(begins), recording.stop_s)
+    last = np.flatnonzero(begins)[1:] - 1
+    if recording.protocol is not None:
+        until_s[last] = recording.stimuli.time_s[last] + recording.protocol.tail_s
+    return until_s
 
 
 def _without_rests(assignment: Assignment, stimuli: Stimuli) -> Assignment:

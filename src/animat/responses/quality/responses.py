@@ -107,7 +107,8 @@ def _left_out(
         message = f"left out, as they belong to no condition: {without:,} of {n_read:,} stimuli{of_these}"
         yield Finding("no-condition", "note", message, float(without))
     if inside is not None and (late := int(np.count_nonzero(read & has_condition & ~inside))):
-        message = f"left out, as their window runs past the end of the recording: {late:,} of {n_read:,} stimuli"
+        where = "the end of the recording, or of its block"
+        message = f"left out, as their window runs past {where}: {late:,} of {n_read:,} stimuli"
         yield Finding("window-past-end", "note" if late < 0.05 * n_read else "warning", message, float(late))
 
 
