@@ -350,7 +350,9 @@ def test_spikes_in_any_order_and_in_any_blocks_are_written_in_ascending_order(
 
 def test_a_date_and_findings_alike_are_kept(tmp_path: Path) -> None:
     lost = Finding("left-out", "note", "3 keys", 3.0), Finding("left-out", "note", "4 rows", 4.0)
-    recording = replace(synthetic_recording(1, patterns=3, channels=4), findings=(*lost, replace(lost[0], value=None)))
+    recording = replace(
+        synthetic_recording(1, patterns=3, channels=4), findings=(*lost, Finding("bad #12", "note", "5 rows"))
+    )
     dated = replace(recording, recorded_at=datetime(2024, 5, 31, 14, tzinfo=UTC))
     write_nwb(dated, tmp_path / "dated.nwb")
     read = read_recording(tmp_path / "dated.nwb")

@@ -58,8 +58,9 @@ def from_metadata(metadata: Mapping[str, str]) -> dict[str, Any]:
         elif key == _LOOP_PULSE:
             pulse = Pulse.from_list(json_data(text, _LOOP_PULSE))
         elif _is_finding(key):
-            severity, _, name = key.partition(": ")
-            findings.append(Finding(name.partition(_AGAIN)[0], severity, text, values.get(key)))  # type: ignore[arg-type]
+            first = key.partition(_AGAIN)[0]
+            severity, _, name = (first if first in metadata else key).partition(": ")
+            findings.append(Finding(name, severity, text, values.get(key)))  # type: ignore[arg-type]
         elif key != _VALUES:
             provenance[key] = text
     origin = {"culture": culture_of(metadata), "recorded_at": date_of(metadata)}

@@ -151,7 +151,7 @@ def extract_responses(
 
 
 def _blocks(source: Recording | ResponseTable) -> tuple[Bool[np.ndarray, " stimuli"], float]:
-    """Whether a block begins with each stimulus, and the set-up before a block, which the recording's clock leaves out."""
+    """Whether a block begins with each stimulus, and the set-up before it, which the recording's clock leaves out."""
     protocol, stimuli = source.protocol if isinstance(source, Recording) else None, source.stimuli
     if protocol is None or protocol.order != "blocked":
         return np.zeros(len(stimuli), bool), 0.0
