@@ -476,6 +476,10 @@ def test_a_rest_that_is_broken_off_was_as_long_as_the_tissue_has_rested(monkeypa
         assert seen.spikes.time_s.min() >= 0
 
 
+def pressed(*_: Any) -> Any:
+    raise KeyboardInterrupt
+
+
 def test_a_delivery_that_is_broken_off_ends_where_the_tissue_is(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -491,4 +495,9 @@ def test_a_delivery_that_is_broken_off_ends_where_the_tissue_is(
         seen = culture.deliver(stimuli[:1], 1.0)
         assert seen.start_s == 6.0 and seen.spikes.time_s.min() >= 0 and seen.spikes.time_s.max() < 1.0
         culture.save_state(tmp_path / "culture.state")
+        # Pressed when the tissue has come to the end.
+        with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+            patch.setattr("animat.cultures.virtual.np.rint", pressed)
+            culture.deliver([], 3.0)
+        assert culture.now_s == 10.0 and culture.deliver(stimuli[:1], 1.0).spikes.time_s.min() >= 0
     small_culture().restore_state(tmp_path / "culture.state")

@@ -276,3 +276,27 @@ def test_recordings_with_different_numbers_of_channels_are_reported() -> None:
     (found,) = (finding for finding in timeline.findings if finding.name == "other-channels")
     assert (found.severity, found.value) == ("warning", 1.0)
     assert f"have {first.n_channels} to {1 + first.n_channels} channels" in found.message
+
+
+@pytest.mark.parametrize("bins", [4, 20, 100])
+def test_tied_responses_are_drawn_as_they_are(bins: int) -> None:
+    """Of few channels, of which many do not answer: as often 0, and of the same mean, as was recorded."""
+    rng = np.random.default_rng(2)
+    x_hz = [rng.poisson(rate, 1_000) / 0.48 for rate in (0.05, 0.5, 2.0)]
+    simulator = fit_histogram(responses_of(*x_hz), bins=bins)
+    edges_hz, evenly = np.asarray(simulator.edges_hz), jax.vmap(simulator.quantile, (None, 0))
+    for condition, recorded_hz in enumerate(x_hz):
+        drawn_hz = np.asarray(evenly(jnp.int32(condition), jnp.arange(10_000) / 10_000))
+        for value_hz in np.unique(edges_hz[1:][np.diff(edges_hz) == 0]):
+            share = np.mean(recorded_hz.astype(np.float32) == value_hz)
+            assert np.mean(drawn_hz == value_hz) == pytest.approx(share, abs=2e-3)
+    first = np.asarray(evenly(jnp.int32(0), jnp.arange(10_000) / 10_000))
+    assert bins < 20 or first.mean() == pytest.approx(x_hz[0].mean(), abs=0.2)
+
+
+@given(st.lists(st.integers(0, 6), min_size=40, max_size=60), st.integers(2, 20))
+def test_without_equal_edges_responses_are_counted_as_numpy_counts_them(counts: list[int], bins: int) -> None:
+    x_hz = np.array(counts, np.float64)
+    simulator = fit_histogram(responses_of(x_hz, x_hz + 1), bins=bins, range_hz=8.0)
+    expected = np.histogram(x_hz.astype(np.float32), np.linspace(0, 8, bins + 1).astype(np.float32))[0]
+    np.testing.assert_allclose(np.diff(simulator.cumulative[0]), expected / len(x_hz), atol=1e-6)

@@ -259,18 +259,18 @@ class VirtualCulture(ComputedCulture):
         if pulses and target_ns <= tissue_ns:
             target_ns = tissue_ns + tissue.step_ns
         time_ns_of, neuron = self._held_ns, self._held_neuron
-        if target_ns > tissue_ns:
-            try:
+        try:
+            if target_ns > tissue_ns:
                 fired_s, fired = tissue.advance((target_ns - tissue_ns) / NS, pulses)
-            except BaseException:
-                self._end_at(end_ns)
-                raise
-            fired_ns = np.rint(fired_s * NS).astype(np.int64)
-            time_ns_of = np.concatenate((time_ns_of, fired_ns)) if len(time_ns_of) else fired_ns
-            neuron = np.concatenate((neuron, fired)) if len(neuron) else fired
-        known = int(time_ns_of.searchsorted(end_ns))
-        self._held_ns, self._held_neuron = time_ns_of[known:], neuron[known:]
-        self._now_ns = end_ns
+                fired_ns = np.rint(fired_s * NS).astype(np.int64)
+                time_ns_of = np.concatenate((time_ns_of, fired_ns)) if len(time_ns_of) else fired_ns
+                neuron = np.concatenate((neuron, fired)) if len(neuron) else fired
+            known = int(time_ns_of.searchsorted(end_ns))
+            self._held_ns, self._held_neuron = time_ns_of[known:], neuron[known:]
+            self._now_ns = end_ns
+        except BaseException:
+            self._end_at(end_ns)
+            raise
         time_s, neuron = (time_ns_of[:known] - start_ns) / NS, neuron[:known]
         self.fired = time_s, neuron
         # Each spike, repeated on every channel that sees its neuron.

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float, Float64, Int, PRNGKeyArray
+from jaxtyping import Array, Float, Float32, Float64, Int, Int64, PRNGKeyArray
 
 from animat.arguments import checked_arguments
 from animat.errors import InvalidArgument, UnusableData
@@ -238,11 +238,21 @@ def fit_histogram(responses: Responses, *, bins: int = 20, range_hz: float | Non
     # Counted in the precision in which thresholds are compared: a response that equals a percentile is above its edge.
     edges = edges.astype(np.float32)
     values = [np.minimum(x.astype(np.float32), edges[-1]) for x in _by_condition(responses)]
-    counts = np.array([np.histogram(x, edges)[0] for x in values])
+    counts = np.array([np.bincount(_bins_of(x, edges), minlength=bins) for x in values])
     # Counts are added up before dividing, so that the last share is exactly 1 and no empty bin is ever drawn.
     below = np.pad(np.cumsum(counts, axis=1), ((0, 0), (1, 0)))
     cumulative = below / below[:, -1:]
     return HistogramSimulator(to_jax(cumulative), to_jax(edges), pooled_percentiles(responses))
+
+
+def _bins_of(x_hz: Float32[np.ndarray, " n"], edges_hz: Float32[np.ndarray, " edges"]) -> Int64[np.ndarray, " n"]:
+    """The bin of each response: from an edge up to the next; where edges are equal, that between the last two of them.
+
+    A response that many others equal, such as 0 with few channels, is then drawn as it is.
+    """
+    place = np.searchsorted(edges_hz, x_hz, side="right") - 1
+    is_tied = (place > 0) & (edges_hz[np.maximum(place - 1, 0)] == x_hz)
+    return np.asarray(np.minimum(place - is_tied, len(edges_hz) - 2))
 
 
 def fit_joint_histogram(
