@@ -384,3 +384,18 @@ def test_a_stretch_ends_after_the_response_where_there_is_time(rate_hz: float, l
     since_s = [stretch.duration_s - stretch.stimuli.time_s[-1] for stretch in stretches[:-1]]
     np.testing.assert_allclose(since_s, least_s, atol=1e-3 if rate_hz == 95.0 else 1e-4)
     assert sum(stretch.duration_s for stretch in stretches) == pytest.approx(block.duration_s)
+
+
+def test_a_disk_with_room_for_the_recording_alone_takes_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    protocol = Protocol(**vars(MIXED) | {"pulse": BALANCED_PULSE, "trials": 20})
+    beside = []
+
+    def full(recording: Recording, file: Path) -> None:
+        beside.append((tmp_path / UNDER_WAY).exists())
+        if beside[-1]:
+            raise InvalidFile(f"{file}: No space left on device")
+        write_nwb(recording, file)
+
+    monkeypatch.setattr("animat.cultures.series.write_nwb", full)
+    (file,) = record_series(lambda: on_maxone(monkeypatch)[0], protocol, tmp_path, sessions=1).files
+    assert beside == [True, False] and [each.name for each in tmp_path.iterdir()] == [file.name]

@@ -8,15 +8,18 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import pytest
 
 from animat.coding.mapping import Thresholds
 from animat.errors import Mismatch
 from animat.execution.training import train
 from animat.robots import Cartpole
+from animat.robots.own_code import code_of
 from animat.robots.registry import REGISTRY, robot_named
-from animat.training.own_code import code_of
+from animat.training.folder import versions_of
 from animat.training.specification import Training
+from animat.watch.view import curve
 from test_training import SMALL
 
 ROVER = '''"""A rover."""
@@ -74,6 +77,28 @@ Rover.friction = 0.5
 if __name__ == "__main__":
     SIGN = 7
 '''
+
+
+ENVIRONMENT = """import gymnasium
+import numpy as np
+
+
+class Point(gymnasium.Env):
+    observation_space = gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float32)
+    action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.x = np.zeros(1, np.float32)
+        return self.x, {}
+
+    def step(self, action):
+        self.x = np.clip(self.x + 0.1 * np.float32(action), -1, 1)
+        return self.x, 1.0, False, False, {}
+
+
+gymnasium.register("InAFile-v0", entry_point=Point, max_episode_steps=20)
+"""
 
 
 @pytest.fixture
@@ -136,3 +161,26 @@ def test_a_training_with_other_code_is_refused(rover: Any, tmp_path: Path) -> No
     rover("SIGN = 1.0", "SIGN = -1.0")
     with pytest.raises(Mismatch, match=r"code of rover-in-a-file: 'sha256 .*' there, 'sha256 .*' now"):
         trained()
+
+
+def test_the_code_of_a_gymnasium_environment_of_one_s_own_counts_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(tmp_path)
+    source = ENVIRONMENT
+    (tmp_path / "environment_in_a_file.py").write_text(source)
+    try:
+        robot = robot_named("gymnasium:environment_in_a_file:InAFile-v0")
+        before = versions_of((), [robot])["code of gymnasium:environment_in_a_file:InAFile-v0"]
+        (tmp_path / "environment_in_a_file.py").write_text(source.replace("0.1 *", "0.2 *"))
+        assert versions_of((), [robot])["code of gymnasium:environment_in_a_file:InAFile-v0"] != before
+    finally:
+        gymnasium.registry.pop("InAFile-v0")
+        sys.modules.pop("environment_in_a_file", None)
+    assert not [name for name in versions_of((), [robot_named("gymnasium:Pendulum-v1")]) if "code" in name]
+
+
+def test_a_thinned_curve_has_its_last_point() -> None:
+    for n in (0, 1, 2_000, 2_001, 4_999):
+        shown = curve("", [*range(n)], [*range(n)], "line", "blue")["x"]
+        assert len(shown) <= 2_001 and shown[:1] == [0.0] * bool(n) and shown[-1:] == [n - 1.0] * bool(n)

@@ -34,8 +34,8 @@ class Inspect(ResponseOptions):
     training"""
     out: Path | None = None
     """Folder for figures; default: none are drawn"""
-    format: Literal["png", "svg", "pdf"] = "png"
-    """Format of the figures"""
+    format: Literal["png", "svg", "pdf"] | None = None
+    """Format of the figures; default: png"""
 
     def run(self) -> dict[str, Any]:
         from animat.recordings.placing import placed_by_date
@@ -49,6 +49,8 @@ class Inspect(ResponseOptions):
         from animat.robots.grid import grid_for
         from animat.robots.registry import robot_named
 
+        if self.format is not None and self.out is None:
+            raise InvalidArgument(f"--format: expected only with --out, as no figures are drawn, got {self.format}")
         if self.optimum is not None:
             try:
                 grid_for(robot_named(self.optimum))
@@ -90,7 +92,9 @@ class Inspect(ResponseOptions):
                     inspected[-1]["optima"] = _optima(self.optimum, inspection.responses, part)
                 if self.out is not None:
                     progress.update(steps * number + 1, total, f"{file.name}, figures")
-                    figures = [str(figure) for figure in draw_inspection(source, inspection, self.out, self.format)]
+                    figures = [
+                        str(figure) for figure in draw_inspection(source, inspection, self.out, (self.format or "png"))
+                    ]
                     print(f"figures: {', '.join(figures)}\n")
                     inspected[-1]["figures"] = figures
                 series.append((file, inspection.responses))
@@ -124,7 +128,7 @@ class Inspect(ResponseOptions):
         first = read_source(file, stimuli=self.stimuli, part=self.part)
         recording = first if isinstance(first, Recording) else None
         try:
-            drawn = draw_series(recording, series, out, self.format)
+            drawn = draw_series(recording, series, out, (self.format or "png"))
         except Mismatch as unlike:
             print(f"no figures of the series: {unlike}")
             return {}

@@ -9,7 +9,7 @@ from typing import Any, Literal
 from tyro.conf import Positional
 
 from animat.cli.command import ResponseOptions, print_warnings
-from animat.errors import Mismatch, UnusableData, expect_at_least, within
+from animat.errors import InvalidArgument, Mismatch, UnusableData, expect_at_least, within
 from animat.writing import expect_writable
 
 
@@ -27,8 +27,8 @@ class Validate(ResponseOptions):
     """Findings to allow, by name, such as dead-window"""
     out: Path | None = None
     """Folder for a figure of each recording; default: none is drawn"""
-    format: Literal["png", "svg", "pdf"] = "png"
-    """Format of the figures"""
+    format: Literal["png", "svg", "pdf"] | None = None
+    """Format of the figures; default: png"""
     seed: int = 1
     """Decides every random draw"""
 
@@ -45,6 +45,8 @@ class Validate(ResponseOptions):
         from animat.responses.readouts import read_readouts
 
         expect_at_least("--seed", self.seed, 0)
+        if self.format is not None and self.out is None:
+            raise InvalidArgument(f"--format: expected only with --out, as no figures are drawn, got {self.format}")
         by = None if self.conditions is None else conditions_named(self.conditions)
         readouts = read_readouts(self.readouts)
         files = list_recordings(self.recordings)
@@ -76,7 +78,9 @@ class Validate(ResponseOptions):
                     print(validation_text(name, validation), end="\n\n")
                     validated.append({"name": name, **validation.to_dict()})
                     if self.out is not None:
-                        figure = save_figure(draw_validation(name, validation), self.out / f"{stem}.{self.format}")
+                        figure = save_figure(
+                            draw_validation(name, validation), self.out / f"{stem}.{self.format or 'png'}"
+                        )
                         print(f"figure: {figure}\n")
                         validated[-1]["figure"] = str(figure)
                 if has_several:

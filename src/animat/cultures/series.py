@@ -7,6 +7,7 @@ import os
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -135,13 +136,12 @@ def record_series(
             expect_writable(folder, room_bytes=room_bytes)
             part = Part(progress, session, 1, sessions, file.name)
             recording = culture.record(protocol, order_seed(seed, session), part, follow)
-            follow.complete(recording)
             if not file.exists():
-                write_nwb(recording, file)
-                follow.written()
+                follow.finish(recording, partial(write_nwb, recording, file))
             elif not read_recording(file).equals(recording):
                 remedy = "remove it, or choose another folder"
                 raise Mismatch(f"{file}: expected the same as when recorded again, got another recording: {remedy}")
+            follow.written()
             if virtual is not None:
                 # After the recording, so that the state is never ahead of a missing recording.
                 virtual.save_state(folder / STATE_FILE, sessions=session + 1)

@@ -82,6 +82,17 @@ class PartialRecording:
         else:
             self.remove()
 
+    def finish(self, recording: Recording, write: Callable[[], object]) -> None:
+        """Write the whole recording, on a full disk in place of the file of the one in progress."""
+        self.complete(recording)
+        try:
+            write()
+        except InvalidFile:
+            if not self._path.exists():
+                raise
+            self.remove()
+            write()
+
     def written(self) -> None:
         """Note that the recording is in its file."""
         self._so_far = None

@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -260,8 +261,7 @@ class _Run:
             seed = order_seed(self.training.seed, number)
             recording = record_within(self.account, self.culture, self.protocol, seed, progress, follow)
             file = folder / recording_name(round(recording.start_min, 3))
-            follow.complete(recording)
-            write_nwb(recording, file)
+            follow.finish(recording, partial(write_nwb, recording, file))
             follow.written()
         self.files.append(file)
         self.keep_state()

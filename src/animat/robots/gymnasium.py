@@ -20,6 +20,7 @@ from animat.extras import install_command, pip_install
 from animat.records import Flag, Number, Whole, read_record, record
 from animat.robots.base import LARGEST_SCALE, LEAST_SCALE, Iterations, Quantity
 from animat.robots.host import LONGEST_KEPT, Bodies, Body, HostRobot, time_limit
+from animat.robots.own_code import code_at
 from animat.robots.registry import REGISTRY
 
 FAMILY = "gymnasium"
@@ -99,12 +100,16 @@ class GymnasiumRobot(HostRobot):
     def versions(self) -> dict[str, str]:
         import gymnasium
 
-        entry = str(gymnasium.spec(self.id.rpartition(":")[2]).entry_point)
+        point: Any = gymnasium.spec(self.id.rpartition(":")[2]).entry_point
+        entry = point if isinstance(point, str) else f"{point.__module__}:{point.__qualname__}"
         engines = {"gymnasium.envs.mujoco": "mujoco", "gymnasium.envs.box2d": "Box2D"}
         engine = next((engine for made_in, engine in engines.items() if entry.startswith(made_in)), "")
         known = importlib.metadata.packages_distributions()
-        names = ["gymnasium", *known.get(engine, ()), *known.get(entry.partition(".")[0].partition(":")[0], ())]
-        return {name: importlib.metadata.version(name) for name in dict.fromkeys(names)}
+        packages = known.get(entry.partition(".")[0].partition(":")[0], ())
+        names = ["gymnasium", *known.get(engine, ()), *packages]
+        module, _, place = entry.partition(":")
+        own = {} if packages else code_at(module, place, self.name)
+        return {name: importlib.metadata.version(name) for name in dict.fromkeys(names)} | own
 
     def body(self, *, with_pictures: bool = False) -> Body:
         module = self.id.rpartition(":")[0]

@@ -24,10 +24,10 @@ from animat.plain_file import expect_no_file
 from animat.robots.base import Robot
 from animat.robots.checking import check_robot
 from animat.robots.host import HostRobot
+from animat.robots.own_code import code_of
 from animat.robots.registry import REGISTRY as ROBOTS
 from animat.training.course import ASSESSED
 from animat.training.group import BEST, Group, split_groups
-from animat.training.own_code import code_of
 from animat.training.policy import Policy
 from animat.training.settings import LEARNER
 from animat.training.specification import CHUNKS, Training

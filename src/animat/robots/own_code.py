@@ -6,6 +6,7 @@ import ast
 import hashlib
 import sys
 from contextlib import suppress
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -20,15 +21,17 @@ def code_of(thing: Any) -> dict[str, str]:
     The code is that of its class and of everything in the class's module that it uses; comments and docstrings do not
     count. Code in other modules does not count either, nor code that is in no file, as in a notebook.
     """
-    kind = type(thing)
-    file = getattr(sys.modules.get(kind.__module__), "__file__", None)
-    if is_ours(thing) or file is None:
-        return {}
-    with suppress(OSError, ValueError, SyntaxError):
-        parts = _used_by(kind.__qualname__.partition(".")[0], ast.parse(Path(file).read_bytes()))
+    return {} if is_ours(thing) else code_at(type(thing).__module__, type(thing).__qualname__, thing.name)
+
+
+def code_at(module: str, place: str, name: str) -> dict[str, str]:
+    """The same for a class or a function at its place in a module, as the code of what is called `name`."""
+    with suppress(OSError, ValueError, SyntaxError, ImportError):
+        file = getattr(sys.modules.get(module), "__file__", None) or getattr(find_spec(module), "origin", None)
+        parts = [] if file is None else _used_by(place.partition(".")[0], ast.parse(Path(file).read_bytes()))
         if parts:
             digest = hashlib.sha256(repr(_shape(parts)).encode()).hexdigest()
-            return {f"code of {thing.name}": f"sha256 {digest[:16]}"}
+            return {f"code of {name}": f"sha256 {digest[:16]}"}
     return {}
 
 
