@@ -15,6 +15,7 @@ from scipy import stats
 from animat.errors import InvalidArgument, Mismatch, UnusableData
 from animat.neurons.fidelity import fidelity
 from animat.neurons.simulator import fit_empirical, fit_histogram, silenced
+from animat.neurons.synthetic import MEANS_HZ, synthetic_simulator
 from animat.neurons.timeline import fit_timeline
 from animat.responses.condition import Condition
 from animat.responses.extraction import extract_series
@@ -300,3 +301,15 @@ def test_without_equal_edges_responses_are_counted_as_numpy_counts_them(counts: 
     simulator = fit_histogram(responses_of(x_hz, x_hz + 1), bins=bins, range_hz=8.0)
     expected = np.histogram(x_hz.astype(np.float32), np.linspace(0, 8, bins + 1).astype(np.float32))[0]
     np.testing.assert_allclose(np.diff(simulator.cumulative[0]), expected / len(x_hz), atol=1e-6)
+
+
+@pytest.mark.parametrize("scale", [0.1, 1.0, 5.0])
+def test_synthetic_responses_pass_thresholds_as_often_as_they_should_whatever_their_means(scale: float) -> None:
+    means_hz = scale * np.array(MEANS_HZ)
+    simulator = synthetic_simulator(means_hz.tolist())
+    uniforms = (jnp.arange(4_000) + 0.5) / 4_000
+    for condition, mean_hz in enumerate(means_hz):
+        drawn_hz = np.asarray(jax.vmap(simulator.quantile, (None, 0))(jnp.int32(condition), uniforms))
+        for threshold_hz in np.asarray(simulator.percentiles)[[1, 5, 9]]:
+            share = stats.gamma.sf(threshold_hz, 6.0, scale=mean_hz / 6.0)
+            assert np.mean(drawn_hz >= threshold_hz) == pytest.approx(share, abs=0.015)

@@ -26,6 +26,7 @@ from animat.errors import InvalidArgument, InvalidFile
 from animat.progress import format_duration
 from animat.robots import Navigation
 from animat.robots.drawing import draw_robot
+from animat.watch.discovery import find
 from animat.watch.session import SessionView, _in_force, stop_session
 from animat.watch.tail import Tail, by_agent
 from watching import session_in
@@ -332,3 +333,11 @@ def test_thousands_of_thresholds_are_thinned_except_in_the_span(n: int) -> None:
     both = _in_force(rows, shown)
     assert both == sorted(both) and [row for row in both if row in shown] == shown
     assert {row[0] for row in both} == {row[0] for row in (*thinned, *shown)}
+
+
+def test_a_training_is_found_whatever_its_folder_is_called(tmp_path: Path) -> None:
+    for name in ("checkpoints", "jobs", "jobs/jobs"):
+        (tmp_path / name).mkdir(parents=True)
+        (tmp_path / name / "training.json").write_text("{}")
+    # In a training there are no others.
+    assert {item.place for item in find(tmp_path)} == {"checkpoints", "jobs"}

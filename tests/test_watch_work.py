@@ -118,6 +118,9 @@ def test_a_training_is_shown_as_far_as_its_checkpoints_go(tmp_path: Path) -> Non
     assert block(together, "Learning curves")["series"] == [*policies, mean]
     assert [row[2] for row in block(together, "Policies")["rows"]] == ["none yet", 29.0, 39.0]
     assert block(together, "Policies")["words"] == "p0 to p1: 55 % return 31.0; p2: 55 %"
+    # What came after the last checkpoint is lost.
+    (tmp_path / ".unfinished" / ".notices" / "p2.json").write_text(json.dumps([0.95, None]))
+    assert block(TrainingView(tmp_path).view(None, 8.0), "Policies")["rows"][2][1] == "50 %"
 
 
 def planned_in(folder: Path, jobs: Sequence[Job]) -> None:

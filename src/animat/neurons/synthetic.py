@@ -20,8 +20,9 @@ def synthetic_simulator(means_hz: Sequence[float] = MEANS_HZ, *, shape: float = 
         x | condition c  ~  Gamma(shape, means_hz[c] / shape)
 
     With the defaults, a response passes the pooled median (38.7 Hz) with probability 0.22, 0.38, 0.53, 0.64 and 0.74.
-    The histogram has the paper's 20 bins from 0 to 120 Hz, the last with all above. P0 and P100 are not those of the
-    distribution, 0 and infinity, but of the paper's n = 500 responses: 1/(n + 1) and n/(n + 1).
+    The histogram has 20 bins, the paper's from 0 to 120 Hz, or as many times wider as the largest mean is larger than
+    54 Hz; the last has all above. P0 and P100 are not those of the distribution, 0 and infinity, but of the paper's
+    n = 500 responses: 1/(n + 1) and n/(n + 1).
 
     Args:
         means_hz: mean response to each condition, Hz per channel.
@@ -39,7 +40,7 @@ def synthetic_simulator(means_hz: Sequence[float] = MEANS_HZ, *, shape: float = 
     if not (np.isfinite(shape) and shape > 0):
         raise InvalidArgument(f"shape: expected a positive number, got {shape!r}")
 
-    edges_hz = np.linspace(0.0, 120.0, 21)
+    edges_hz = np.linspace(0.0, 120.0 * (means.max() / MEANS_HZ[-1]), 21)
     cumulative = gammainc(shape, edges_hz * shape / means[:, None])
     cumulative[:, -1] = 1.0
 

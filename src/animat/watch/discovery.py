@@ -21,6 +21,7 @@ _MARKS = {kind: names[0] for kind, names in MARKERS.items() if kind not in ("rec
 """The file that identifies each kind."""
 _DEPTH, _MOST_FOLDERS, _MOST_ITEMS, _MOST_RECORDINGS = 4, 4000, 2000, 500
 _SKIPPED = ("jobs", "figures", "tables", "checkpoints")
+"""Folders in an item's own, in which there is nothing to watch."""
 _LOCKS = Path("/proc/locks")
 _SILENT_S = 60.0
 """If locks cannot be looked up, a folder without a change for this long counts as idle."""
@@ -63,7 +64,8 @@ def _folders(folder: Path) -> Iterator[Path]:
         yield parent
         if depth < _DEPTH:
             _, names, _ = next(os.walk(parent), ("", [], []))
-            below = [parent / name for name in sorted(names) if name[0] != "." and name not in _SKIPPED]
+            skipped = _SKIPPED if any((parent / mark).is_file() for mark in _MARKS.values()) else ()
+            below = [parent / name for name in sorted(names) if name[0] != "." and name not in skipped]
             folders += [(each, depth + 1) for each in below if not each.is_symlink()]
 
 

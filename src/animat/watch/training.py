@@ -13,7 +13,7 @@ from jaxtyping import Float64
 from animat.errors import InvalidFile
 from animat.execution.task import UNFINISHED
 from animat.training.policy import CURVE, whole_curve
-from animat.watch.discovery import changed_s, state_of
+from animat.watch.discovery import changed_s, is_locked, state_of
 from animat.watch.files import JobProgress, arrays_in, expect_own, job_progress, json_of, listed, mapped, number, text
 from animat.watch.view import View, chart, curve, facts, in_blocks, settings, table, time_left
 
@@ -49,7 +49,8 @@ class TrainingView(View):
         minutes = (manifest.get("simulators") or {}).get("recorded_at_min", [])
         planned, iterations = min(training["policies"], _MOST_POLICIES), training["iterations"]
         progress = job_progress(self.folder)
-        curves, shares = self._learned(planned, progress)
+        # What a stopped training had done since its last checkpoint is lost.
+        curves, shares = self._learned(planned, {} if is_locked(self.folder) is False else progress)
         done = sum(shares.values())
         self._speed.see(done * iterations)
         left_s = self._speed.left_s((planned - done) * iterations)
