@@ -373,6 +373,20 @@ def test_ctrl_c_is_not_held_up_by_the_patience_with_an_agent(
     assert (session.ending.by, session.ending.message) == ("person", "stopped by a person (Ctrl-C or kill)")
 
 
+@pytest.mark.usefixtures("in_the_foreground")
+def test_what_a_culture_answers_after_ctrl_c_is_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("animat.closed_loop.running._UNANSWERED_S", 0.05)
+
+    def slow(culture: FakeCulture, observed: Observed) -> Observed:
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(0.5)
+        return observed
+
+    with FakeCulture(fault=slow, at=6) as culture:
+        session = run(tmp_path, culture)
+    assert session.ending.by == "person" and session.to_dict()["unanswered_pulses"] == 0
+
+
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), GeneratorExit(), asyncio.CancelledError()])
 def test_whatever_an_agent_raises_ends_the_session(tmp_path: Path, error: BaseException) -> None:
     class Raises:

@@ -749,3 +749,5 @@ def test_names_of_channels_that_look_like_numbers_stay_different(tmp_path: Path)
         (tmp_path / "a_stimuli.csv").write_text("time_s,frequency_hz\n0.05,10\n")
         recording = read_recording(tmp_path / "a_spikes.csv")
         assert sorted(map(str, recording.channels.label.tolist())) == labels
+    (tmp_path / "a_stimuli.csv").write_text("time_s,frequency_hz,pattern\n0.05,10,1\n0.1,10,NaN\n0.15,10,\n")
+    assert read_recording(tmp_path / "a_spikes.csv").stimuli.pattern.tolist() == [1, -1, -1]

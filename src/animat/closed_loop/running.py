@@ -269,9 +269,11 @@ class _Supervisor:
         self._halt(ending)
 
     def _stopped(self) -> Ending | None:
-        """The ending if a person stopped the loop some time ago, and it does not end by itself."""
+        """The ending if a person stopped the loop some time ago, and an agent or the robot keeps it from ending."""
         since_s, ending = self._by_person or (math.inf, None)
-        return ending if time.monotonic() > since_s + _UNANSWERED_S else None
+        # What the culture answers to the last pulses is waited for.
+        is_theirs = self._driver.deadline[1] not in ("the culture", "the clock")
+        return ending if is_theirs and time.monotonic() > since_s + _UNANSWERED_S else None
 
     def _halt(self, ending: Ending) -> None:
         """Stop the culture in a separate thread: a backend that hangs must not block the end as well."""

@@ -143,7 +143,8 @@ def plain_column(table: TextTable, place: int, name: str) -> Column:
         numbers = as_numbers(cells)
     except ValueError:
         return np.array(cells, dtype=np.str_)
-    if len(np.unique(numbers)) < len({re.sub(r"\.0*$", "", cell.strip()) for cell in {*cells}}):
+    named = {cell for cell, number in zip(cells, numbers.tolist(), strict=True) if number == number}
+    if len({*as_numbers([*named]).tolist()}) < len({re.sub(r"\.0*$", "", name.strip()) for name in named}):
         # Names that look like numbers, such as 01 beside 1.
         return np.array(cells, dtype=np.str_)
     if name == "spike_channel" and np.any(wrong := numbers % 1 > 0):
