@@ -336,6 +336,9 @@ def test_a_goal_with_within_has_no_grid_and_says_so() -> None:
         (CARTPOLE, ""),
         ("avoid pole_angle outside -10..10 deg; avoid cart_position outside -0.4..0.4 m", ""),
         ("avoid pole_angle outside -12..12 deg", ""),
+        # What is but a little beyond makes no difference.
+        ("avoid pole_angle outside -0.21..0.21 rad; avoid cart_position outside -0.505..0.505 m", ""),
+        ("avoid pole_angle outside -13..13 deg", "pole_angle beyond -0.209 to 0.209 rad"),
         (f"{CARTPOLE}; drive cart_position in 0.1..0.3 m", ""),
         (
             "avoid pole_angle outside -12..12 deg; drive cart_position above 0.55 m",

@@ -36,6 +36,7 @@ if len(animat.__name__) > 1:
         return jnp.abs(x_m) > 1
 
 OTHER = 2.0
+GAINS = [1.0]
 
 
 class At(NamedTuple):
@@ -62,7 +63,7 @@ class Rover(animat.Robot[At]):
 
     def advance(self, uniforms, state, u):
         # Ends far away.
-        x_m = state.x_m + 0.1 * u
+        x_m = state.x_m + 0.1 * u * GAINS[0]
         return At(x_m), reward(x_m), far(x_m)
 
     def observe(self, state):
@@ -74,6 +75,7 @@ def unused():
 
 
 Rover.friction = 0.5
+GAINS.append(2.0)
 if __name__ == "__main__":
     SIGN = 7
 '''
@@ -131,6 +133,7 @@ def rover(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
         ("    def observe(self, state):", '    def observe(self, state):\n        """New."""', True),
         ("SIGN = 7", "SIGN = 8", True),
         ("Rover.friction = 0.5", "Rover.friction = 0.6", False),
+        ("GAINS.append(2.0)", "GAINS.append(3.0)", False),
         ("OTHER = 2.0", "OTHER = 3.0", True),
         ("SIGN = 1.0", "SIGN = -1.0", False),
         ("return SIGN * jnp.abs(x_m)", "return SIGN * x_m", False),

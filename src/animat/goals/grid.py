@@ -17,8 +17,9 @@ from animat.robots.base import Quantity, Robot, capability
 from animat.robots.grid import Axis, Grid
 
 _SAMPLES = 4096
-_INSIDE = 1e-3
-"""How far inside the ends of an axis a state is put that is beyond them, in shares of the axis."""
+_INSIDE, _BEYOND = 1e-3, 0.01
+"""How far inside the ends of an axis a state is put that is beyond them, and how far beyond makes no difference, in
+shares of the axis."""
 
 
 def grid_with_goal(
@@ -98,14 +99,15 @@ def _left(
         goes_on = task_ends & ~goal_ends(margins) & ~goal_ends(_margins(objectives, spec, robot.observe(later)))
         coordinates, found = grid.to_coordinates(after), []
         for number, axis in enumerate(axes):
-            spare = 0.0 if axis.periodic else _INSIDE * (axis.high - axis.low)
-            value = coordinates[number]
-            inside = value if axis.periodic else jnp.clip(value, axis.low + spare, axis.high - spare)
+            width, value = axis.high - axis.low, coordinates[number]
+            inside = jnp.clip(value, axis.low + _INSIDE * width, axis.high - _INSIDE * width)
+            excess = jnp.abs(value - jnp.clip(value, axis.low, axis.high))
             within = grid.to_state((*coordinates[:number], inside, *coordinates[number + 1 :]))
             _, _, ends_within = robot.advance(uniforms, within, u)
             # The first coordinate does not affect how the others move, but these may affect all.
             differs = number > 0 or jnp.any(jnp.abs(apart(after) - apart(within)) > _INSIDE)
-            found.append(goes_on & ~ends_within & differs & (jnp.abs(value - inside) > spare))
+            is_left = (excess > _BEYOND * width) & (not axis.periodic)
+            found.append(goes_on & ~ends_within & differs & is_left)
         return jnp.stack(found)
 
     each = jax.vmap(jax.vmap(leaves, (None, None, 0)), (0, 0, None))

@@ -13,6 +13,7 @@ from typing import Any
 from animat.registry import is_ours
 
 _DEFINITIONS = ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef
+_IMPORTS = ast.Import, ast.ImportFrom
 
 
 def code_of(thing: Any) -> dict[str, str]:
@@ -39,6 +40,8 @@ def _used_by(name: str, module: ast.Module) -> list[ast.stmt]:
     """The statements of a module that define a name, and all that these use, in their order."""
     statements = (_Plain().visit(statement) for statement in module.body if not _is_main(statement))
     defines = [(statement, _defined_in(statement)) for statement in statements if statement is not None]
+    imported = {name for statement, names in defines if isinstance(statement, _IMPORTS) for name in names}
+    defines = [(statement, names or {*_changed_by(statement)} - imported) for statement, names in defines]
     wanted, used = [name], {name}
     while wanted:
         current = wanted.pop()
@@ -58,15 +61,24 @@ def _defined_in(statement: ast.stmt) -> set[str]:
     for node in ast.walk(statement):
         if isinstance(node, _DEFINITIONS):
             names.add(node.name)
-        elif isinstance(node, ast.Import | ast.ImportFrom):
+        elif isinstance(node, _IMPORTS):
             names |= {(alias.asname or alias.name).partition(".")[0] for alias in node.names}
         elif isinstance(node, ast.Name | ast.Attribute | ast.Subscript) and isinstance(node.ctx, ast.Store):
-            # Of Rover.gain = 2 it is the rover that is changed.
-            whole: ast.expr = node
-            while isinstance(whole, ast.Attribute | ast.Subscript):
-                whole = whole.value
-            names |= {whole.id} if isinstance(whole, ast.Name) else set()
+            names |= {*_whole(node)}
     return names
+
+
+def _changed_by(statement: ast.stmt) -> list[str]:
+    """The name of what a method is called of, as it may change it: `GAINS.append(2)`."""
+    call = statement.value if isinstance(statement, ast.Expr) else None
+    return _whole(call.func) if isinstance(call, ast.Call) and isinstance(call.func, ast.Attribute) else []
+
+
+def _whole(part: ast.expr) -> list[str]:
+    """The name of what something is a part of: of `Rover.gain` and `GAINS[0]`, the rover and the gains."""
+    while isinstance(part, ast.Attribute | ast.Subscript):
+        part = part.value
+    return [part.id] if isinstance(part, ast.Name) else []
 
 
 def _is_main(statement: ast.stmt) -> bool:
