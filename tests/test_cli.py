@@ -250,6 +250,7 @@ def test_help_says_what_a_number_of_one_is_without_the_option(capsys: pytest.Cap
     assert "Decides every random draw (default: 1)" in said and "(default: True)" not in said
 
 
+@pytest.mark.oracle
 def test_evaluate_writes_over_no_file_but_an_evaluation(
     recordings: Path, policies: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

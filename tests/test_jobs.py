@@ -320,6 +320,7 @@ def test_a_folder_that_is_gone_may_have_been_removed_or_be_out_of_sight(tmp_path
         carry_out_alone(Join("a"), gone, gone / ".notices" / "a")
 
 
+@pytest.mark.oracle
 def test_too_many_open_files_are_not_taken_for_too_little_memory(tmp_path: Path) -> None:
     class Full(ThreadPoolExecutor):
         def submit(self, *_: Any, **__: Any) -> Any:

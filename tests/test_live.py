@@ -629,6 +629,7 @@ def test_from_the_command_line_it_says_what_it_did_and_exits_as_the_loop_ended(
     assert printed_too.out.startswith("2 recordings in 10 min")
 
 
+@pytest.mark.oracle
 def test_the_command_takes_a_protocol(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

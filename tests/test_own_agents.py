@@ -138,6 +138,7 @@ def slider_of(timeline: SimulatorTimeline) -> Policy:
     return replace(policy, robot=named("Slider"), weights=weights, scales=np.ones(2, np.float32))
 
 
+@pytest.mark.oracle
 def test_an_agent_outside_jax_is_evaluated_as_one_in_jax_and_a_policy_as_itself() -> None:
     timeline = five_conditions()
     policy = policy_of(timeline, Cartpole(episode_limit=30))
@@ -162,7 +163,7 @@ def test_an_agent_outside_jax_is_evaluated_as_one_in_jax_and_a_policy_as_itself(
         pytest.param("mine", Wrong(0.5), "whole number from 0 to 4, got 0.5", marks=pytest.mark.oracle),
         pytest.param("mine", Wrong(None), "whole number from 0 to 4, got None", marks=pytest.mark.oracle),
         # A closed loop refuses it, too.
-        ("mine", Wrong(2.0), "whole number from 0 to 4, got 2.0"),
+        pytest.param("mine", Wrong(2.0), "whole number from 0 to 4, got 2.0", marks=pytest.mark.oracle),
         pytest.param("mine", Wrong(SystemExit(3)), "agents: mine: SystemExit: 3", marks=pytest.mark.oracle),
         pytest.param(
             "mine",
@@ -183,7 +184,12 @@ def test_an_agent_outside_jax_is_evaluated_as_one_in_jax_and_a_policy_as_itself(
             Wrong(ZeroDivisionError("no")),
             r"agents: mine: ZeroDivisionError: no \(.*test_own_agents.py, line \d+\)",
         ),
-        ("mine", BeginsWith(None), "agents: mine: begin: expected another object, which acts in .*, got None"),
+        pytest.param(
+            "mine",
+            BeginsWith(None),
+            "agents: mine: begin: expected another object, which acts in .*, got None",
+            marks=pytest.mark.oracle,
+        ),
         pytest.param(
             "mine",
             Itself(),
@@ -209,7 +215,7 @@ def test_an_agent_outside_jax_is_evaluated_as_one_in_jax_and_a_policy_as_itself(
             "mine", Tabular(jnp.arange(5)), r"first axis of length one, got the shapes \(5,\)", marks=pytest.mark.oracle
         ),
         ("p0", Plain(), "agents: expected names other than .*, got p0"),
-        ("mine", 3, "agents: mine: expected an Actor, or a method `act`, got 3"),
+        pytest.param("mine", 3, "agents: mine: expected an Actor, or a method `act`, got 3", marks=pytest.mark.oracle),
         pytest.param("random", Plain(), "agents: expected names other than .*, got random", marks=pytest.mark.oracle),
         pytest.param(
             "policies", Plain(), "agents: expected names other than .*, got policies", marks=pytest.mark.oracle

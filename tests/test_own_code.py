@@ -152,6 +152,7 @@ def test_animats_own_need_no_code() -> None:
     assert code_of(Cartpole()) == code_of(Thresholds(9)) == {}
 
 
+@pytest.mark.oracle
 def test_a_training_with_other_code_is_refused(rover: Any, tmp_path: Path) -> None:
     def trained() -> Any:
         training = Training(robot_named("rover-in-a-file"), None, policies=1, iterations=480, algorithm=SMALL)

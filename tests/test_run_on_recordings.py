@@ -146,7 +146,7 @@ USUAL = " the usual one with --culture virtual"
     ("pulses", "file", "delivered", "warned"),
     [
         ((WEAK, WEAK), None, WEAK, ""),
-        ((BALANCED_PULSE, None), None, BALANCED_PULSE, OTHERS),
+        pytest.param((BALANCED_PULSE, None), None, BALANCED_PULSE, OTHERS, marks=pytest.mark.oracle),
         pytest.param((None, None), None, PUBLISHED_PULSE, USUAL, marks=pytest.mark.oracle),
         ((None, None), WEAK, WEAK, ""),
     ],
