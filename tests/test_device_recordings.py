@@ -366,7 +366,7 @@ def test_recover_keeps_what_a_killed_recording_had_without_a_pulse(
     assert read_recording(kept).equals(recording) and not (live / "recordings" / UNDER_WAY).exists()
     # A damaged one stays as it is.
     (live / "recordings" / UNDER_WAY).write_bytes(b"PK\x03\x04 cut off")
-    assert main(["recover", str(live / "recordings")]) == 0
+    assert main(["recover", str(live / "recordings")]) == 0 and "it is damaged" in capsys.readouterr().out
     assert (live / "recordings" / "interrupted" / "damaged.npz").read_bytes() == b"PK\x03\x04 cut off"
     # What can be made again is not kept.
     provenance = {"source": "virtual culture: simulated", "seed": "1"}

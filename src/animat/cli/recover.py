@@ -36,7 +36,8 @@ class Recover(Command):
             keep_interrupted(folder)
         kept = sorted(set((folder / INTERRUPTED).glob("*")) - before)
         for file in kept:
-            print(f"{file}: what a run that was killed had recorded")
+            is_damaged = "; it is damaged, and kept as it is" if file.suffix == ".npz" else ""
+            print(f"{file}: what a run that was killed had recorded{is_damaged}")
         if not kept:
             print(f"{folder}: nothing to keep: the recording that was cut short can be made again")
         return {"recordings": [str(file) for file in kept]}
