@@ -5,11 +5,13 @@ from __future__ import annotations
 import importlib
 import sys
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import gymnasium
 import pytest
+from gymnasium.envs.classic_control import PendulumEnv
 
 from animat.coding.mapping import Thresholds
 from animat.errors import Mismatch
@@ -182,6 +184,14 @@ def test_the_code_of_a_gymnasium_environment_of_one_s_own_counts_too(
         gymnasium.registry.pop("InAFile-v0")
         sys.modules.pop("environment_in_a_file", None)
     assert not [name for name in versions_of((), [robot_named("gymnasium:Pendulum-v1")]) if "code" in name]
+
+
+def test_an_environment_made_by_a_partial_function_has_versions() -> None:
+    gymnasium.register("Partial-v0", entry_point=partial(PendulumEnv, g=9.0), max_episode_steps=20)
+    try:
+        assert "gymnasium" in versions_of((), [robot_named("gymnasium:Partial-v0")])
+    finally:
+        gymnasium.registry.pop("Partial-v0")
 
 
 def test_a_thinned_curve_has_its_last_point() -> None:

@@ -254,6 +254,13 @@ def print_warnings(findings: Sequence[Finding]) -> None:
         print(f"warning: {message}", file=sys.stderr)
 
 
+def figure_format(given: str | None, out: Path | None) -> Any:
+    """The format of the figures; raises InvalidArgument for one without a folder, as no figures are drawn then."""
+    if given is not None and out is None:
+        raise InvalidArgument(f"--format: expected only with --out, as no figures are drawn, got {given}")
+    return given or "png"
+
+
 def policies_for(robot: str | None, mapping: str | None, path: Path) -> dict[str, Policy]:
     """Load the policies of a file or a folder, after importing their custom robot and mapping, if they have these."""
     from animat.coding.checking import check_mapping

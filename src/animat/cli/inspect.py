@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional
 
-from animat.cli.command import ResponseOptions, print_warnings
+from animat.cli.command import ResponseOptions, figure_format, print_warnings
 from animat.errors import AnimatError, InvalidArgument, Mismatch, UnusableData, in_min, within
 from animat.progress import Bar, Part, Progress
 from animat.writing import expect_writable
@@ -49,8 +49,7 @@ class Inspect(ResponseOptions):
         from animat.robots.grid import grid_for
         from animat.robots.registry import robot_named
 
-        if self.format is not None and self.out is None:
-            raise InvalidArgument(f"--format: expected only with --out, as no figures are drawn, got {self.format}")
+        drawn_as = figure_format(self.format, self.out)
         if self.optimum is not None:
             try:
                 grid_for(robot_named(self.optimum))
@@ -92,9 +91,7 @@ class Inspect(ResponseOptions):
                     inspected[-1]["optima"] = _optima(self.optimum, inspection.responses, part)
                 if self.out is not None:
                     progress.update(steps * number + 1, total, f"{file.name}, figures")
-                    figures = [
-                        str(figure) for figure in draw_inspection(source, inspection, self.out, (self.format or "png"))
-                    ]
+                    figures = [str(figure) for figure in draw_inspection(source, inspection, self.out, drawn_as)]
                     print(f"figures: {', '.join(figures)}\n")
                     inspected[-1]["figures"] = figures
                 series.append((file, inspection.responses))
@@ -128,7 +125,7 @@ class Inspect(ResponseOptions):
         first = read_source(file, stimuli=self.stimuli, part=self.part)
         recording = first if isinstance(first, Recording) else None
         try:
-            drawn = draw_series(recording, series, out, (self.format or "png"))
+            drawn = draw_series(recording, series, out, figure_format(self.format, out))
         except Mismatch as unlike:
             print(f"no figures of the series: {unlike}")
             return {}

@@ -8,8 +8,8 @@ from typing import Any, Literal
 
 from tyro.conf import Positional
 
-from animat.cli.command import ResponseOptions, print_warnings
-from animat.errors import InvalidArgument, Mismatch, UnusableData, expect_at_least, within
+from animat.cli.command import ResponseOptions, figure_format, print_warnings
+from animat.errors import Mismatch, UnusableData, expect_at_least, within
 from animat.writing import expect_writable
 
 
@@ -45,8 +45,7 @@ class Validate(ResponseOptions):
         from animat.responses.readouts import read_readouts
 
         expect_at_least("--seed", self.seed, 0)
-        if self.format is not None and self.out is None:
-            raise InvalidArgument(f"--format: expected only with --out, as no figures are drawn, got {self.format}")
+        drawn_as = figure_format(self.format, self.out)
         by = None if self.conditions is None else conditions_named(self.conditions)
         readouts = read_readouts(self.readouts)
         files = list_recordings(self.recordings)
@@ -78,9 +77,7 @@ class Validate(ResponseOptions):
                     print(validation_text(name, validation), end="\n\n")
                     validated.append({"name": name, **validation.to_dict()})
                     if self.out is not None:
-                        figure = save_figure(
-                            draw_validation(name, validation), self.out / f"{stem}.{self.format or 'png'}"
-                        )
+                        figure = save_figure(draw_validation(name, validation), self.out / f"{stem}.{drawn_as}")
                         print(f"figure: {figure}\n")
                         validated[-1]["figure"] = str(figure)
                 if has_several:

@@ -190,8 +190,8 @@ def _files(path: Path) -> list[Path]:
         listed = [file for file in path.iterdir() if not file.name.startswith(".")]
     files = sorted(file for file in listed if any(map(file.match, IN_FOLDERS)))
     if not files:
-        left = f": animat recover {path} keeps what a killed run had recorded of a device"
-        left *= (path / UNDER_WAY).exists()
+        keeps = f": animat recover {path} keeps what a killed run had recorded of a device"
+        left = keeps if (path / UNDER_WAY).exists() else ""
         raise InvalidFile(f"{path}: expected a folder of recordings ({', '.join(IN_FOLDERS)}), found none in it{left}")
     return files
 

@@ -101,7 +101,9 @@ class GymnasiumRobot(HostRobot):
         import gymnasium
 
         point: Any = gymnasium.spec(self.id.rpartition(":")[2]).entry_point
-        entry = point if isinstance(point, str) else f"{point.__module__}:{point.__qualname__}"
+        # A partial function has no name.
+        place = getattr(point, "__qualname__", "")
+        entry = point if isinstance(point, str) else f"{point.__module__}:{place}"
         engines = {"gymnasium.envs.mujoco": "mujoco", "gymnasium.envs.box2d": "Box2D"}
         engine = next((engine for made_in, engine in engines.items() if entry.startswith(made_in)), "")
         known = importlib.metadata.packages_distributions()
