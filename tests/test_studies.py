@@ -872,6 +872,7 @@ COMPARED = (
             "culture.pulses: expected only for a culture that",
         ),
         ("[[robots]]\nname = 'cartpole'\nparameters = { name = 1 }", "expected parameters among"),
+        ('[[arms]]\nname = "a"\nshadowing = "off"', "arms.shadowing: expected True, False or 'drawn', got 'off'"),
         ("[algorithm]\nhiden = 8", "hiden: no such setting in [algorithm]; expected some of environments"),
         ("[algorithm]\nhidden = 'x'", "algorithm.hidden: expected a number"),
         ("[algorithm]\nhidden = 64.0", "algorithm.hidden: expected a whole number, got 64.0"),

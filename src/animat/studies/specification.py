@@ -21,7 +21,7 @@ from animat.robots.base import MOST_AT_ONCE, MOST_ITERATIONS, Robot
 from animat.robots.registry import REGISTRY, robot_named
 from animat.studies.source import LISTED, Source
 from animat.training.lessons import Lesson, expect_lessons
-from animat.training.settings import SAC, Policies
+from animat.training.settings import SAC, Policies, Shadowing
 
 MOST_TRAINED = 20_000
 """Policies of all arms on all robots: each is a file, and five are a job."""
@@ -158,7 +158,7 @@ class Arm:
 
     name: Name
     mapping: str = "1-threshold"
-    shadowing: Flag | Literal["drawn"] = True
+    shadowing: Shadowing = True
     delivery: Literal["chosen", "shuffled"] = "chosen"
     percentiles: Literal["moving", "first"] = "moving"
     trained: Flag = True

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import Field, PlainValidator
 from typing_extensions import TypedDict
 
-from animat.errors import InvalidArgument
+from animat.errors import InvalidArgument, shown
 from animat.recordings.recorded_culture import RecordedCulture
 from animat.records import Flag, Number, Positive, Share, Whole, read_record, record
 
@@ -26,6 +26,16 @@ FORMER = {
     "entropy_share": "target_entropy_ratio",
 }
 """Names of settings in older files, and their current names."""
+
+
+def _expect_shadowing(value: Any) -> Any:
+    # Not as a union, whose error would name one of the two types only.
+    if not isinstance(value, bool) and value != "drawn":
+        raise ValueError(f"expected True, False or 'drawn', got {shown(value)}")
+    return value
+
+
+Shadowing = Annotated[bool | Literal["drawn"], PlainValidator(_expect_shadowing)]
 
 
 @record

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Annotated, Any, Generic, Literal, TypeVar, get_type_hints
 
 import numpy as np
-from pydantic import BeforeValidator, Field, InstanceOf, PlainValidator
+from pydantic import BeforeValidator, Field, InstanceOf
 
 from animat.coding.decoder import expect_one_command
 from animat.coding.encoder import expect_electrode_pulses
@@ -24,11 +24,10 @@ from animat.robots.base import MOST_ITERATIONS, Robot
 from animat.robots.host import HostRobot
 from animat.robots.registry import register_robot, robot_named
 from animat.training.lessons import EPISODES, MOST_EPISODES, Lesson, expect_lessons
-from animat.training.settings import SAC, Policies, PulseCost
+from animat.training.settings import SAC, Policies, PulseCost, Shadowing
 from animat.wrappers import Delivery, NeuralObservation, ShuffledDelivery, TrialCosts
 
 Percentiles = Literal["moving", "first"]
-Shadowing = bool | Literal["drawn"]
 
 CHUNKS = 60
 """Number of chunks in a training: the units of progress, refresh and checkpoint; a culture minute each by default."""
@@ -60,13 +59,6 @@ def _mapping_named(name: str) -> Mapping:
     if name == "none":
         raise InvalidArgument("mapping: expected None without neurons, mapping=None in Python, got 'none'")
     return mapping_named(name)
-
-
-def _expect_shadowing(value: Any) -> Any:
-    # Not as a union, whose error would name one of the two types only.
-    if not isinstance(value, bool) and value != "drawn":
-        raise ValueError(f"expected True, False or 'drawn', got {shown(value)}")
-    return value
 
 
 Commands = Annotated[
@@ -108,7 +100,7 @@ class Training:
     policies: Policies = 10
     iterations: Annotated[Whole, Field(ge=1, le=MOST_ITERATIONS)] = 800_000
     seed: Seed = 1
-    shadowing: Annotated[Shadowing, PlainValidator(_expect_shadowing)] = True
+    shadowing: Shadowing = True
     duration_min: Positive | None = None
     percentiles: Percentiles = "moving"
     delivery: Delivery = "chosen"
