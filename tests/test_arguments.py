@@ -72,6 +72,13 @@ def test_lists_and_dictionaries_are_checked_inside_and_unions_said_in_full(tmp_p
             np.arange(11.0),
             patterns=1.5,  # type: ignore[arg-type]
         ),
+        "executor: expected an executor, such as a concurrent.futures.ProcessPoolExecutor, or None, got 3": lambda: (
+            animat.run_study(
+                animat.paper_study(),
+                tmp_path,
+                executor=3,  # type: ignore[arg-type]
+            )
+        ),
         "path: expected a path, got None": lambda: animat.read_study(None),  # type: ignore[arg-type]
         "path: expected a name ending in .nwb, got r.txt": lambda: animat.write_nwb(
             synthetic_recording(1, patterns=3, channels=16), "r.txt"

@@ -171,6 +171,8 @@ def test_a_folder_of_another_study_is_refused(finished: Path, tmp_path: Path) ->
     before = files(finished)
     with pytest.raises(Mismatch, match=r"another \(study\.policies: 2 there, 3 now\)"):
         run_study(replace(read_study(TINY), policies=3), finished, base=TINY.parent)
+    with pytest.raises(Mismatch, match=r"another \(study\.seed: \d+ there, 99 now\)"):
+        run_study(replace(read_study(TINY), seed=99), finished, base=TINY.parent)
     assert files(finished) == before
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "thesis.txt").write_text("mine")

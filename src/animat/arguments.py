@@ -20,6 +20,7 @@ _ONE = {
     "Conditions": "conditions, such as 'frequency:5,10'",
     "Channels": "a channel table, animat.Channels",
     "Culture": "a culture, such as animat.VirtualCulture(seed=1)",
+    "Executor": "an executor, such as a concurrent.futures.ProcessPoolExecutor",
     "Environment": "an environment, such as animat.Animat(animat.Cartpole(), animat.Thresholds(9), 9)",
     "Goal": "a goal, such as 'avoid pole_angle outside -12..12 deg'",
     "Mapping": "a mapping, such as animat.Thresholds(9)",

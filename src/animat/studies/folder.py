@@ -125,7 +125,9 @@ def _is_claimed(folder: Path, what: str, manifest: dict[str, Any], files: list[s
     # Work that stopped at its first step left only these files, and may be replaced.
     left = (path for path in folder.rglob("*") if not path.is_dir() and not path.name.startswith("."))
     if any(path.name not in files and path.parent.name != NOTICES for path in left):
-        raise folder_mismatch(folder, what, first_difference(found, manifest, ignoring=("fingerprint",)))
+        # What its specification states, by the names that it has there.
+        difference = first_difference(found, manifest, ignoring=("fingerprint",), first=("study",))
+        raise folder_mismatch(folder, what, difference)
     return False
 
 
