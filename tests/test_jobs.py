@@ -133,6 +133,15 @@ def test_progress_goes_up_to_all_and_says_what_runs(tmp_path: Path) -> None:
     assert not any("nearly" in note for note in notes)
 
 
+def test_the_share_done_counts_jobs_of_earlier_runs(tmp_path: Path) -> None:
+    first = joined("a", cost_s=3.0)
+    run([first], tmp_path)
+    kept = Kept()
+    run([first, joined("b", "a", takes_s=0.5)], tmp_path, progress=kept)
+    assert min(done / total for done, total, _ in kept.updates) >= 0.75
+    assert kept.updates[-1][:2] == (4.0, 4.0)
+
+
 def test_what_is_planned_and_what_it_costs_is_in_a_file_until_all_is_done(tmp_path: Path) -> None:
     jobs = [joined("b", "a", cost_s=2.5), joined("a", cost_s=0.1), Job("c/d", Fail(), ("b",))]
     for _ in ("anew", "going on"):

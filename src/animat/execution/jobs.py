@@ -88,7 +88,7 @@ class Jobs:
         # Left by a run that was killed; the locks stay, as they may still be held.
         for stale in notices.glob("*.json"):
             stale.unlink(missing_ok=True)
-        total_s = sum(job.cost_s for job in self.waiting)
+        total_s = sum(costs_s.values())
         running: dict[Future[TaskResult], Job] = {}
         failed: list[AnimatError] = []
         cpu_s: dict[str, float] = {}
