@@ -64,10 +64,9 @@ def read_response_npz(path: Path) -> ResponseTable | None:
     if window is not None and (window.shape != (2,) or window.dtype.kind not in "iuf"):
         raise UnusableData(f"response_window_ms: expected start and end in ms, got {window.dtype} {window.shape}")
     window_ms = None if window is None else (float(window[0]), float(window[1]))
-    labels = arrays.pop("channel_label", np.arange(n_channels))
+    columns = {"channel_label": np.arange(n_channels), **arrays}
     provenance = {"source": path.name, "format": "NPZ of responses"}
-    findings = left_out_findings("keys", left_out)
-    return _table(values, NPZ_KEYS[key], labels, arrays, window_ms, provenance, findings)
+    return _table(values, NPZ_KEYS[key], columns, window_ms, provenance, left_out_findings("keys", left_out))
 
 
 def read_response_table(table: TextTable) -> ResponseTable | None:
@@ -76,7 +75,7 @@ def read_response_table(table: TextTable) -> ResponseTable | None:
         return None
     is_long = table.place(("channel",)) is not None
     values, kind, labels, first_of = _long(table) if is_long else _wide(table)
-    columns: dict[str, Any] = {}
+    columns: dict[str, Any] = {"channel_label": labels}
     for name, names in TABLE_COLUMNS.items():
         if (place := table.place(names)) is not None:
             columns[name] = _per_stimulus(table, place, name, first_of)
@@ -88,7 +87,7 @@ def read_response_table(table: TextTable) -> ResponseTable | None:
     table.note_left_out([alias for name, names in TABLE_COLUMNS.items() if name not in columns for alias in names])
     window_ms = None if start_ms is None or end_ms is None else (start_ms, end_ms)
     provenance = {"source": table.path.name, "format": "CSV of responses"}
-    return _table(values, kind, labels, columns, window_ms, provenance, tuple(table.findings))
+    return _table(values, kind, columns, window_ms, provenance, tuple(table.findings))
 
 
 def _wide(table: TextTable) -> _Read:
@@ -170,7 +169,6 @@ def _constant(table: TextTable, name: str) -> float | None:
 def _table(
     values: Column,
     kind: ResponseKind,
-    labels: Column,
     columns: dict[str, Any],
     window_ms: tuple[float, float] | None,
     provenance: dict[str, str],
@@ -179,19 +177,19 @@ def _table(
     """The table, with stimuli and channels checked like plain columns."""
     has_times = "stimulus_time_s" in columns
     times = np.asarray(columns.pop("stimulus_time_s", np.arange(len(values), dtype=np.float64)))
-    plain = PlainColumns(np.empty(0), np.empty(0, np.int64), times, channel_label=labels, **columns)
+    plain = PlainColumns(np.empty(0), np.empty(0, np.int64), times, **columns)
     # Times in another shape are refused below.
     if times.ndim == 1 and len(values) != len(times):
         raise UnusableData(f"responses: expected a row for each of {len(times)} stimuli, got {len(values)}")
     if not has_times:
         order = "the table has no stimulus times: its rows are assumed to be in order of presentation"
         findings = (Finding("stimulus-times-unknown", "note", order), *findings)
-    recording = plain.to_recording({}, findings)
+    recording = plain.to_recording(provenance, findings)
+    taken = ("channels", "stimuli", "start_min", "presentation", "provenance", "findings")
     return ResponseTable(
         values=np.asarray(values, dtype=np.float64)[np.argsort(times, kind="stable")],
         kind=kind,
         has_times=has_times,
         window_ms=window_ms,
-        **{name: getattr(recording, name) for name in ("channels", "stimuli", "start_min", "presentation", "findings")},
-        provenance={**provenance, **recording.provenance},
+        **{name: getattr(recording, name) for name in taken},
     )
