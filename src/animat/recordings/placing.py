@@ -41,7 +41,7 @@ def placed_by_date(series: Sequence[D]) -> list[D]:
     """
     starts_min = [each.start_min for each in series]
     dates = [each.recorded_at for each in series if each.recorded_at is not None]
-    of_device = [_is_of_device(each.culture) for each in series]
+    of_device = [each.culture is not None and each.culture.kind in ("cl1", "maxone") for each in series]
     is_stated = any(each.start_min and not known for each, known in zip(series, of_device, strict=True))
     if len(dates) < len(series) or is_stated:
         return list(series)
@@ -63,7 +63,3 @@ def placed_by_date(series: Sequence[D]) -> list[D]:
     note = Finding("placed-by-date", "note", message)
     changed: list[Any] = list(zip(series, placed_min, strict=True))
     return [dataclasses.replace(each, start_min=at, findings=(*each.findings, note)) for each, at in changed]
-
-
-def _is_of_device(culture: RecordedCulture | None) -> bool:
-    return culture is not None and culture.kind in ("cl1", "maxone")
