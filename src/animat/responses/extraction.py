@@ -14,20 +14,12 @@ from animat.recordings.findings import Finding
 from animat.recordings.quality import recording_findings
 from animat.recordings.recording import Recording, ResponseTable
 from animat.responses.bursts import separate_bursts
-from animat.responses.conditions import (
-    NO_CONDITION,
-    Assignment,
-    ByInterval,
-    Conditions,
-    conditions_named,
-    default_conditions,
-)
+from animat.responses.conditions import NO_CONDITION, ByInterval, Conditions, conditions_named, default_conditions
 from animat.responses.quality.one_culture import series_findings
 from animat.responses.quality.responses import findings_on
 from animat.responses.readouts import ALL, Readouts, readouts_on
 from animat.responses.responses import Responses, Trials
 from animat.responses.windows import DEFAULT_WINDOW_MS, Window, check_window, read_windows
-from animat.stimulation.stimulus import Stimuli
 
 SILENCE_S = 1.05
 """A longer time without a pulse is silence; not that between pulses at 1 Hz, which come a little early or late."""
@@ -89,7 +81,10 @@ def extract_responses(
         raise UnusableData(f"channels: expected at least one, got a {what} without any; x is a mean over channels")
     readouts = readouts_on(readouts, source.channels)
     by = conditions_named(by) if isinstance(by, str) else by or default_conditions(stimuli, source.protocol)
-    assignment = _without_rests(by.assign(stimuli), stimuli)
+    assignment = by.assign(stimuli)
+    # A rest has no condition that pulses have too: what is read after it is no response to a stimulus.
+    shared = stimuli.is_rest & np.isin(assignment.condition, assignment.condition[~stimuli.is_rest])
+    assignment = replace(assignment, condition=np.where(shared, NO_CONDITION, assignment.condition))
     # Trials without a condition are read too, as the history of others.
     read, inside = stimuli.is_last_of_presentation, None
     begins, setup_s = _blocks(source)
@@ -166,13 +161,6 @@ def _observed_until_s(recording: Recording, begins: Bool[np.ndarray, " stimuli"]
     if recording.protocol is not None:
         until_s[last] = recording.stimuli.time_s[last] + recording.protocol.tail_s
     return until_s
-
-
-def _without_rests(assignment: Assignment, stimuli: Stimuli) -> Assignment:
-    """Rests without the condition that they share with pulses: what is read after one is no response to a stimulus."""
-    pulsed = np.unique(assignment.condition[~stimuli.is_rest])
-    shared = stimuli.is_rest & np.isin(assignment.condition, pulsed)
-    return replace(assignment, condition=np.where(shared, NO_CONDITION, assignment.condition))
 
 
 def _window_of(table: ResponseTable, by: Conditions, window_ms: Window) -> tuple[Window, tuple[Finding, ...]]:
