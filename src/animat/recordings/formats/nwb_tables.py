@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import uuid
-from collections.abc import Mapping
 from datetime import UTC, datetime
 from typing import Any
 
@@ -41,12 +40,16 @@ _FILE_KEYS = ("experiment_description", "lab", "institution")
 def nwb_file(recording: Recording, spike_counts: Int64[np.ndarray, " channels"]) -> NWBFile:
     """A recording as a pynwb object tree, with room for so many spikes of each channel, which the caller writes."""
     texts = {_text("provenance", k): _text("provenance", v) for k, v in to_metadata(recording).items()}
+    date = date_of(texts) if "recorded_at" in texts else UNKNOWN_DATE
+    if date is None:
+        expected, got = "an ISO 8601 date such as 2024-05-31T14:00:00+09:00", texts["recorded_at"]
+        raise InvalidArgument(f"provenance['recorded_at']: expected {expected}, got {got!r}")
     nwb = NWBFile(
         session_description=texts.get(
             "session_description", "Spikes of a neuronal culture on a multi-electrode array, under stimulation."
         ),
         identifier=str(uuid.uuid4()),
-        session_start_time=_date(texts),
+        session_start_time=date,
         experimenter=_split(texts["experimenter"], ";") if "experimenter" in texts else None,
         keywords=_split(texts.get("keywords", "multi-electrode array, neuronal culture, electrical stimulation"), ","),
         source_script="animat.recordings.formats.nwb.write_nwb",
@@ -173,17 +176,6 @@ def _text(name: str, text: object) -> str:
     if "\0" in text or any("\ud800" <= character <= "\udfff" for character in text):
         raise InvalidArgument(f"{name}: expected text without null characters or lone surrogates, got {text!r}")
     return text
-
-
-def _date(texts: Mapping[str, str]) -> datetime:
-    if "recorded_at" not in texts:
-        return UNKNOWN_DATE
-    if (date := date_of(texts)) is None:
-        raise InvalidArgument(
-            "provenance['recorded_at']: expected an ISO 8601 date such as 2024-05-31T14:00:00+09:00, got "
-            f"{texts['recorded_at']!r}"
-        )
-    return date
 
 
 def _split(text: str, mark: str) -> list[str]:
