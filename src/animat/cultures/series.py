@@ -141,7 +141,7 @@ def record_series(
             elif not read_recording(file).equals(recording):
                 remedy = "remove it, or choose another folder"
                 raise Mismatch(f"{file}: expected the same as when recorded again, got another recording: {remedy}")
-            follow.written()
+            follow.remove()
             if virtual is not None:
                 # After the recording, so that the state is never ahead of a missing recording.
                 virtual.save_state(folder / STATE_FILE, sessions=session + 1)

@@ -33,8 +33,8 @@ _REPEATABLE = ("virtual", "replay")
 class PartialRecording:
     """A `follow` function for `Culture.record`; a context manager that removes the file at the end.
 
-    What there is of a recording of a device, which cannot be repeated, when an error or Ctrl-C ends it before it is
-    `written`, goes into the folder `interrupted`, or else into a temporary one; after a kill, when the next run begins,
+    What there is of a recording of a device, which cannot be repeated, when an error or Ctrl-C ends it before `finish`
+    returns, goes into the folder `interrupted`, or else into a temporary one; after a kill, when the next run begins,
     whatever that one records. Until it is there, the file stays.
 
     Args:
@@ -74,17 +74,14 @@ class PartialRecording:
                 return
         error.add_note("and then: what was recorded so far could not be kept")
 
-    def complete(self, recording: Recording) -> None:
-        """Note that this is all; one that can be repeated leaves its room on the disk to the recording's own file."""
+    def finish(self, recording: Recording, write: Callable[[], object]) -> None:
+        """Write the whole recording, on a full disk in place of the file of the one in progress."""
         self._so_far = lambda: recording
         if self._is_kept:
             self._write()
         else:
+            # It can be repeated: its room on the disk is for the recording's own file.
             self.remove()
-
-    def finish(self, recording: Recording, write: Callable[[], object]) -> None:
-        """Write the whole recording, on a full disk in place of the file of the one in progress."""
-        self.complete(recording)
         try:
             write()
         except InvalidFile:
@@ -92,9 +89,6 @@ class PartialRecording:
                 raise
             self.remove()
             write()
-
-    def written(self) -> None:
-        """Note that the recording is in its file."""
         self._so_far = None
         self.remove()
 

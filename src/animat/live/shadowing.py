@@ -262,7 +262,6 @@ class _Run:
             recording = record_within(self.account, self.culture, self.protocol, seed, progress, follow)
             file = folder / recording_name(round(recording.start_min, 3))
             follow.finish(recording, partial(write_nwb, recording, file))
-            follow.written()
         self.files.append(file)
         self.keep_state()
         try:
