@@ -7,7 +7,7 @@ import operator
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -205,53 +205,46 @@ class Driver:
         is_burst = response["is_burst"]
         self._last_pulse_s = self._zero_s + float(after_s[0])
         again = is_burst and loop.on_burst == "repeat" and repeats < loop.most_repeats and not is_warm_up
-        tick: dict[str, Any] = {
-            "number": self._n_presented,
-            "agent": agent.name,
-            "episode": episode,
-            "iteration": iteration,
-            "chosen": chosen,
-            "delivered": delivered,
-            "frequency_hz": frequency_hz,
-            "patterns": tuple(stimulus.pattern for stimulus in stimuli),
-            "pulse_time_s": tuple(pulse_time_s.tolist()) if stimuli else (),
-            "read_after_s": float(after_s[0]),
-            "handled": "warm-up" if is_warm_up else "repeated" if again else "unfinished",
-            "command": None,
-            "reward": None,
-            "observation": (),
-            "terminated": False,
-            "truncated": False,
-            "late_s": late_s,
-            "decided_s": decided_s,
-            **response,
-        }
-        self._n_presented += 1
         came = self._remembered
         if loop.history is not None and stimuli:
             is_rested = bool(pulse_time_s[0] - came.at_s > SILENCE_S)
             came = loop.history.when(came, float(after_s[0]), is_rested=is_rested)
-            self._remembered = loop.history.after(came, delivered, tick["rate_hz"], is_burst=is_burst)
-        if loop.remembering is not None:
-            tick["neurons"] = loop.remembering.observed(self._remembered)
-        tick["wall_s"] = self.clock.now_s() - self._wall_zero_s
-        record = self.unfinished = stretch_record(stretch, stimuli, dict(tick))
+            self._remembered = loop.history.after(came, delivered, response["rate_hz"], is_burst=is_burst)
+        tick = Tick(
+            number=self._n_presented,
+            agent=agent.name,
+            episode=episode,
+            iteration=iteration,
+            chosen=chosen,
+            delivered=delivered,
+            frequency_hz=frequency_hz,
+            patterns=tuple(stimulus.pattern for stimulus in stimuli),
+            pulse_time_s=tuple(pulse_time_s.tolist()) if stimuli else (),
+            read_after_s=float(after_s[0]),
+            handled="warm-up" if is_warm_up else "repeated" if again else "unfinished",
+            late_s=late_s,
+            decided_s=decided_s,
+            wall_s=self.clock.now_s() - self._wall_zero_s,
+            neurons=() if loop.remembering is None else loop.remembering.observed(self._remembered),
+            **response,
+        )
+        self._n_presented += 1
+        record = self.unfinished = stretch_record(stretch, stimuli, vars(tick))
         adapted: dict[str, Any] = {}
         try:
             if late_s and loop.on_late == "stop":
                 raise Stop(Ending("lateness", f"a pulse came {1000 * late_s:.3g} ms late, and on_late is stop"))
             if not (again or is_warm_up):
-                tick |= self._move(agent, x_hz, is_burst, iteration)
+                tick = replace(tick, **self._move(agent, x_hz, is_burst, iteration))
             if self._adaptive is not None and stimuli and (agent.calibrates or is_warm_up) and not is_burst:
                 self._adaptive.add(delivered, came, np.asarray(x_hz))
                 self._percentiles = self._adaptive.percentiles()
                 adapted["percentiles_hz"] = self._percentiles.tolist()
         finally:
             # Whatever happens to the robot, the culture's response is logged.
-            finished = Tick(**tick)
-            self.records.append(record._replace(fields={**record.fields, "tick": vars(finished), **adapted}))
+            self.records.append(record._replace(fields={**record.fields, "tick": vars(tick), **adapted}))
             self.unfinished = None
-        return finished, again
+        return tick, again
 
     def _move(
         self, agent: Agent, x_hz: Float64[np.ndarray, "*readouts"], is_burst: bool, iteration: int

@@ -15,7 +15,7 @@ STOP_FILE = "STOP"
 """In a session's folder: creating it, empty or not, ends the session as Ctrl-C does."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Tick:
     """One presentation, its response, and the result. Times are in seconds on the session's clock.
 
@@ -56,11 +56,11 @@ class Tick:
     active_ratio: float
     is_burst: bool
     handled: Handled
-    command: float | tuple[float, ...] | None
-    reward: float | None
-    observation: tuple[float, ...]
-    terminated: bool
-    truncated: bool
+    command: float | tuple[float, ...] | None = None
+    reward: float | None = None
+    observation: tuple[float, ...] = ()
+    terminated: bool = False
+    truncated: bool = False
     late_s: float
     decided_s: float
     wall_s: float
@@ -70,10 +70,11 @@ class Tick:
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Self:
         """A tick from its `vars`, read back from JSON."""
-        # Older logs have neither readouts nor neurons, which are empty then.
-        known: dict[str, Any] = {each.name: data[each.name] for each in fields(cls) if each.name in data}
-        known |= {name: tuple(value) for name, value in known.items() if isinstance(value, list)}
-        return cls(**known)
+        # Older logs have neither readouts nor neurons.
+        data = {"readout_hz": (), "neurons": (), **data}
+        values: dict[str, Any] = {each.name: data[each.name] for each in fields(cls)}
+        values |= {name: tuple(value) for name, value in values.items() if isinstance(value, list)}
+        return cls(**values)
 
 
 @dataclass(frozen=True)
@@ -98,28 +99,19 @@ class Stop(Exception):
         self.ending = ending
 
 
-HEAD = {
-    "tick": "number",
-    "time_s": "read_after_s",
-    **{name: name for name in ("agent", "episode", "iteration", "chosen", "delivered", "frequency_hz", "patterns")},
-    "pulse_times_s": "pulse_time_s",
-    **{name: name for name in ("electrode_pulses", "spikes", "rate_hz", "active_ratio", "is_burst", "handled")},
-    **{name: name for name in ("command", "reward")},
-}
-"""Columns before the observation, and their names in a tick's fields. `time_s` is the time of the pulse after which the
-response was read, on the session's clock."""
-
-TAIL = {"is_terminated": "terminated", "is_truncated": "truncated"}
-TAIL |= {name: name for name in ("late_s", "decided_s", "wall_s")}
-"""Columns after the observation."""
+HEAD: tuple[str, ...] = ("tick", "time_s", "agent", "episode", "iteration", "chosen", "delivered", "frequency_hz")
+HEAD += ("patterns", "pulse_times_s", "electrode_pulses", "spikes", "rate_hz", "active_ratio", "is_burst", "handled")
+HEAD += ("command", "reward")
+TAIL = ("is_terminated", "is_truncated", "late_s", "decided_s", "wall_s")
+"""Columns before and after the observation."""
 
 
 class TickTable:
     """Writes ticks to a CSV file, one line each, for users of a spreadsheet or pandas without this package.
 
-    All digits are written; `Tick` describes the columns. Unknown values are empty cells: the command and the
-    observation if the response did not move the robot. Flags are 0 or 1; patterns and times of several pulses are
-    separated by spaces.
+    All digits are written; `Tick` describes the columns, of which `time_s` is its `read_after_s`. Unknown values are
+    empty cells: the command and the observation if the response did not move the robot. Flags are 0 or 1; patterns and
+    times of several pulses are separated by spaces.
 
     Each group of channels has a column of its `rate_hz` and, if there are several, of its `command`. The file is open
     for text, without translation of line ends.
@@ -136,14 +128,22 @@ class TickTable:
     def add(self, tick: Mapping[str, Any]) -> None:
         """Write a tick, as in the fields of its record, with its `electrode_pulses`."""
         command, n_readouts = tick["command"], len(self._header.readouts)
-        texts = {name: " ".join(map(str, tick[name])) for name in ("patterns", "pulse_time_s")}
-        texts |= {name: self._header.conditions[tick[name]] for name in ("chosen", "delivered")}
-        flags = {name: int(tick[name]) for name in ("is_burst", "terminated", "truncated")}
-        cells = {**tick, **texts, **flags}
-        row = [cells[name] for name in HEAD.values()]
+        cells = {
+            **tick,
+            "tick": tick["number"],
+            "time_s": tick["read_after_s"],
+            "chosen": self._header.conditions[tick["chosen"]],
+            "delivered": self._header.conditions[tick["delivered"]],
+            "patterns": " ".join(map(str, tick["patterns"])),
+            "pulse_times_s": " ".join(map(str, tick["pulse_time_s"])),
+            "is_burst": int(tick["is_burst"]),
+            "is_terminated": int(tick["terminated"]),
+            "is_truncated": int(tick["truncated"]),
+        }
+        row = [cells[name] for name in HEAD]
         row[-2:-1] = command if isinstance(command, Sequence) else (command,) * max(1, n_readouts)
         row += tick["readout_hz"] if n_readouts else ()
         row += tick["observation"] or (None,) * len(self._header.observed)
-        row += (cells[name] for name in TAIL.values())
+        row += (cells[name] for name in TAIL)
         # NaN is not equal to itself.
         self._writer.writerow([value if value == value else None for value in row])
