@@ -5,10 +5,10 @@ from __future__ import annotations
 import operator
 from collections.abc import Callable
 from dataclasses import fields, replace
-from itertools import pairwise
-from math import floor
+from math import copysign, floor
 from typing import Annotated, Any
 
+import numpy as np
 from pydantic import Field
 
 from animat.errors import InvalidArgument, UnsafeStimulus
@@ -109,8 +109,8 @@ class Limits:
         for amplitude in (phase.amplitude for phase in pulse.phases):
             got = f"{amplitude:g}{rounding}: give the pulse a smaller amplitude"
             _expect("amplitude", abs(amplitude) <= self.amplitude, expected, got)
-        signs = [sign_of(phase.amplitude) for phase in pulse.phases]
-        is_alternating = not self.alternates or all(before != after for before, after in pairwise(signs))
+        signs = np.sign([phase.amplitude for phase in pulse.phases])
+        is_alternating = not self.alternates or bool(np.all(signs[1:] != signs[:-1]))
         _expect("alternates", is_alternating, "successive phases of different signs", f"{pulse}{rounding}")
 
 
@@ -172,9 +172,4 @@ def delivered_pulse(pulse: Pulse, amplitude_step: float) -> Pulse:
 
 def steps_of(amplitude: float, amplitude_step: float) -> int:
     """An amplitude in whole steps, rounded half away from 0: opposite amplitudes stay opposite."""
-    return sign_of(amplitude) * floor(abs(amplitude) / amplitude_step + 0.5)
-
-
-def sign_of(amplitude: float) -> int:
-    """-1, 0 or 1."""
-    return (amplitude > 0) - (amplitude < 0)
+    return int(copysign(floor(abs(amplitude) / amplitude_step + 0.5), amplitude))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
@@ -36,12 +35,10 @@ def shortfalls(
     if lacks:
         n_frames = rate_hz * sum(observed.duration_s for _, observed in parts)
         n_spikes = sum(len(observed.spikes.time_s) for _, observed in parts)
-        lost = Counter[str]()
-        for what, count in left_out.items():
-            lost["frames" if what.startswith("frames") else "spikes"] += count
-        share = max(
-            (lost["frames"] + rate_hz * unobserved_s) / n_frames, lost["spikes"] / max(1, lost["spikes"] + n_spikes)
-        )
+        lost_frames = sum(count for what, count in left_out.items() if what.startswith("frames"))
+        lost_spikes = sum(left_out.values()) - lost_frames
+        share_of_frames = (lost_frames + rate_hz * unobserved_s) / n_frames
+        share = max(share_of_frames, lost_spikes / max(1, lost_spikes + n_spikes))
         message = f"the device reported, or should have, what the recording lacks: {', '.join(lacks)}"
         yield Finding("left-out", "warning" if share > LOST_SHARE else "note", message, share)
     delays_s = [observed.stimulus_time_s - block.stimuli.time_s for block, observed in parts]
