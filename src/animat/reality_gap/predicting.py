@@ -162,10 +162,8 @@ def few_predicted(robot: Robot[Any], starts: Starts | None, called: Sequence[str
     who = f"{robot.name} is stepped" if isinstance(robot, HostRobot) else f"{some_of(called)}: called" if called else ""
     if who:
         episodes = ROLL_OUTS * episodes_each(robot, starts, is_slow=True)
-        few = (
-            f"predicted returns are from {episodes} episodes, and their intervals from {BOOTSTRAPS_ON_HOST} bootstraps"
-        )
-        yield Finding("few-predicted", "note", f"{who} outside JAX: {few}")
+        few = f"from {episodes} episodes, and their intervals from {BOOTSTRAPS_ON_HOST} bootstraps"
+        yield Finding("few-predicted", "note", f"{who} outside JAX: predicted returns are {few}")
 
 
 def roll_out_seed(seed: int, group: int, on: int) -> int:

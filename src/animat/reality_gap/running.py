@@ -35,14 +35,7 @@ from animat.goals.tally import Outcome
 from animat.progress import Progress, in_phase
 from animat.reality_gap.calibration import Calibration
 from animat.reality_gap.outlook import outlook
-from animat.reality_gap.predicting import (
-    EPISODES,
-    MOST_ON_HOST,
-    Prediction,
-    few_predicted,
-    pool,
-    predict,
-)
+from animat.reality_gap.predicting import EPISODES, MOST_ON_HOST, Prediction, few_predicted, pool, predict
 from animat.reality_gap.reasons import Evidence, reasons
 from animat.reality_gap.row import Row
 from animat.reality_gap.session_responses import outcomes, read_responses
