@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_right
+from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from math import isfinite
@@ -64,31 +65,31 @@ class History:
     """
 
     def __init__(self) -> None:
-        self._starts: list[int] = []
-        self._starts_on: dict[int, list[int]] = {}
+        # On each electrode, and on any of them as None.
+        self._starts_on: dict[int | None, list[int]] = defaultdict(list)
         self._seen_ns = 0
         self.busy_until_ns = -(2**63)
         """When the last stimulus ends; before any, too long ago for every gap."""
 
     def in_second_to(self, time_ns: int, electrode: int | None = None) -> int:
         """Stimuli, on one electrode or on any, that began less than a second before a time not before the last."""
-        starts = self._starts if electrode is None else self._starts_on.get(electrode, ())
+        starts = self._starts_on.get(electrode, ())
         return len(starts) - bisect_right(starts, time_ns - NS)
 
-    def last_on(self, electrode: int) -> int | None:
-        """When the last stimulus on an electrode began, however long ago; None: there was none."""
+    def last_on(self, electrode: int | None) -> int | None:
+        """When the last stimulus on an electrode, or on any, began, however long ago; None: there was none."""
         starts = self._starts_on.get(electrode)
         return starts[-1] if starts else None
 
     def add(self, events: Sequence[Event], now_ns: int) -> None:
         """Add stimuli in order of time, and forget those more than a second old."""
         self._seen_ns = now_ns
-        _forget(self._starts, now_ns)
         for start_ns, end_ns, electrodes in events:
-            self._starts.append(start_ns)
-            for electrode in electrodes:
-                starts = self._starts_on.setdefault(electrode, [])
-                _forget(starts, now_ns)
+            for electrode in (None, *electrodes):
+                starts = self._starts_on[electrode]
+                if len(starts) > 1:
+                    # The last one is kept: a limit on intervals may be longer than a second.
+                    del starts[: bisect_right(starts, now_ns - NS, 0, len(starts) - 1)]
                 starts.append(start_ns)
             self.busy_until_ns = end_ns
 
@@ -101,16 +102,11 @@ class History:
         """
         behind_ns = max(0, self._seen_ns - now_ns)
         self._seen_ns = now_ns
-        lasts_ns = self.busy_until_ns - self._starts[-1] if self._starts else 0
-        for starts in (self._starts, *self._starts_on.values()):
+        before_ns = self.last_on(None)
+        for starts in self._starts_on.values():
             starts[:] = [min(start_ns - behind_ns, now_ns) for start_ns in starts]
-        if self._starts:
-            self.busy_until_ns = self._starts[-1] + lasts_ns
-
-
-def _forget(starts: list[int], now_ns: int) -> None:
-    """Drop starts a second or more ago, except the last: a limit on intervals may be longer than a second."""
-    del starts[: min(bisect_right(starts, now_ns - NS), len(starts) - 1)]
+        if before_ns is not None:
+            self.busy_until_ns += self._starts_on[None][-1] - before_ns
 
 
 class Guard:
