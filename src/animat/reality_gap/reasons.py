@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -72,18 +72,15 @@ def few_samples(evidence: Evidence) -> Finding | None:
 
 def lateness(evidence: Evidence) -> Finding | None:
     """Pulses came so late that a condition's frequency was different."""
-    session, conditions, most = evidence.session, [], 0.0
+    session, late = evidence.session, dict[str, float]()
     for i, condition in enumerate(session.responses.conditions):
         late_s = session.late_s[session.responses.condition == i]
         if not len(late_s) or (part := float(late_s.mean()) / condition.interval_s) < LEAST_LATE:
             continue
-        most = max(most, part)
         share, late_ms = float(np.mean(late_s > 0)), 1000 * float(late_s[late_s > 0].mean())
-        conditions.append(
-            f"{condition.label} in {100 * share:.0f} % of its trials, by {late_ms:.2g} ms of its "
-            f"{1000 * condition.interval_s:.3g} on average"
-        )
-    return Finding("lateness", "note", f"pulses came late: {', '.join(conditions)}", most) if conditions else None
+        by = f"by {late_ms:.2g} ms of its {1000 * condition.interval_s:.3g} on average"
+        late[f"{condition.label} in {100 * share:.0f} % of its trials, {by}"] = part
+    return _note("lateness", "pulses came late: {}", late)
 
 
 def bursts(evidence: Evidence) -> Finding | None:
@@ -125,21 +122,17 @@ def trend(evidence: Evidence) -> Finding | None:
                 for each in (responses.rate_hz, time_s / 60)
             )
             tested.append((condition.label, linregress(t, x), float(np.ptp(t)) / max(float(x.mean()), 1e-9)))
-    changes, most = [], 0.0
+    changes = dict[str, float]()
     for label, fit, scale in tested:
         change, error = fit.slope * scale, fit.stderr * scale
         if fit.pvalue < LEVEL / len(tested) and abs(change) >= LEAST_TREND:
-            most = max(most, change, key=abs)
-            changes.append(
-                f"to {label} {'rise' if change > 0 else 'fall'} by {100 * abs(change):.0f} % +- {100 * error:.0f}"
-            )
-    if not changes:
-        return None
+            by = f"{100 * abs(change):.0f} % +- {100 * error:.0f}"
+            changes[f"to {label} {'rise' if change > 0 else 'fall'} by {by}"] = change
     message = (
-        f"the culture changed over the session's {np.ptp(time_s) / 60:.0f} min: responses {', '.join(changes)} (of "
-        f"their mean, standard error), and the returns with them (Kendall's tau with time {with_time.statistic:+.2f})"
+        f"the culture changed over the session's {np.ptp(time_s) / 60:.0f} min: responses {{}} (of their mean, "
+        f"standard error), and the returns with them (Kendall's tau with time {with_time.statistic:+.2f})"
     )
-    return Finding("trend", "note", message, most)
+    return _note("trend", message, changes)
 
 
 def memory(evidence: Evidence) -> Finding | None:
@@ -169,7 +162,7 @@ def answers(evidence: Evidence) -> Finding | None:
     responses, names = evidence.session.responses, evidence.session.responses.readouts.names
     tested = [(i, d) for i in conditions.tolist() for d in range(len(names))]
     level = LEVEL / (len(tested) + len(names))
-    differences, most = [], 0.0
+    differences = dict[str, float]()
     for i, d in tested:
         n, expected = measured.presented[:, i], float(predicted.commanded.mean[i, d])
         mean, between = _mean_over(measured.total[:, i, d], n)
@@ -179,18 +172,17 @@ def answers(evidence: Evidence) -> Finding | None:
         difference = mean - expected
         p = 2 * stdtr(episodes - 1, -abs(difference) / np.hypot(error, expected_error))
         if p < level and abs(difference) >= LEAST_COMMAND:
-            most = max(most, difference, key=abs)
             each_hz = responses.read_hz[(responses.condition == i) & evidence.session.moved], recorded_hz[i]
             measured_hz, usual_hz = (x_hz.reshape(len(x_hz), -1)[:, d].mean() for x_hz in each_hz)
             on = f" on {names[d]}" if len(names) > 1 else ""
-            differences.append(
+            text = (
                 f"{responses.conditions[i].label}{on} to {mean:+.2f} +- {error:.2f} ({expected:+.2f} +- "
                 f"{expected_error:.2f}; mean {measured_hz:.3g} Hz, {usual_hz:.3g} in the recording)"
             )
-    if differences:
-        message = f"conditions lead to different mean commands than predicted: {', '.join(differences)}"
-        return Finding("answers", "note", message, most)
-    return _offset(evidence, conditions, level) if len(conditions) else None
+            differences[text] = difference
+    if not differences and len(conditions):
+        return _offset(evidence, conditions, level)
+    return _note("answers", "conditions lead to different mean commands than predicted: {}", differences)
 
 
 def _offset(evidence: Evidence, conditions: Int64[np.ndarray, " conditions"], level: float) -> Finding | None:
@@ -233,7 +225,7 @@ def repetition(evidence: Evidence) -> Finding | None:
         of = responses.condition == condition
         if (of & usable).any():
             y[of] -= y[of & usable].mean(axis=0)
-    repeats, groups, most = repetitions(responses), [], 0.0
+    repeats, groups = repetitions(responses), dict[str, float]()
     tested = [(label, d, *ends) for label, ends in _REPETITIONS.items() for d in range(len(names))]
     for label, d, low, high in tested:
         of = usable & (repeats >= low) & (repeats <= high)
@@ -243,15 +235,10 @@ def repetition(evidence: Evidence) -> Finding | None:
             continue
         mean, error = _mean_over(total, n)
         if abs(mean) > max(LEAST_REPETITION, -stdtrit(episodes - 1, LEVEL / len(tested) / 2) * error):
-            most = max(most, mean, key=abs)
             on = f" on {names[d]}" if len(names) > 1 else ""
-            groups.append(f"{mean:+.2f} +- {error:.2f}{on} {label}")
-    if not groups:
-        return None
-    message = (
-        f"responses depend on repetition, which simulators do not model: their mean rank differs by {', '.join(groups)}"
-    )
-    return Finding("repetition", "note", message, most)
+            groups[f"{mean:+.2f} +- {error:.2f}{on} {label}"] = mean
+    what = "responses depend on repetition, which simulators do not model: their mean rank differs by {}"
+    return _note("repetition", what, groups)
 
 
 CHECKS: dict[str, Callable[[Evidence], Finding | None]] = {
@@ -265,6 +252,11 @@ CHECKS: dict[str, Callable[[Evidence], Finding | None]] = {
     "mean commands": answers,
 }
 """All checks, by their descriptions in messages."""
+
+
+def _note(name: str, message: str, found: Mapping[str, float]) -> Finding | None:
+    """A note on what was found, with the largest of its numbers; None if nothing was."""
+    return Finding(name, "note", message.format(", ".join(found)), max(found.values(), key=abs)) if found else None
 
 
 def _mean_over(total: Float64[np.ndarray, " episodes"], n: Int64[np.ndarray, " episodes"]) -> tuple[float, float]:
