@@ -182,6 +182,7 @@ def test_the_tolerance_can_be_typed_or_left_out() -> None:
         ("electrode:1+b", "expected whole numbers"),
         ("electrode:1,,2", "expected numbers of electrodes from 0 on, joined by +; got an empty set"),
         ("electrode:-1+2", "expected numbers of electrodes from 0 on"),
+        ("electrode:-1", "joined by +; got -1"),
         ("electrode:1+2,2+1", "expected each set of electrodes once"),
         ("pattern:1.5", "expected whole numbers"),
         ("pattern:3,3", "each once"),

@@ -243,7 +243,10 @@ BAD_NPZ: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "NaN times": (SPIKES | {"spike_time_s": np.array([0.0, np.nan, 1.0])}, "spike_time_s: .* got 1 of 3 NaN"),
     "infinite stimulus": ({"stimulus_time_s": np.array([np.inf])}, "stimulus_time_s: .* got 1 of 1 NaN or infinite"),
-    "text for times": ({"spike_time_s": np.array(["a", "b", "c"])}, "spike_time_s: expected numbers, got <U1"),
+    "text for times": (
+        {"spike_time_s": np.array(["a", "b", "c"])},
+        "spike_time_s: expected numbers, got <U1 .such as 'a'",
+    ),
     "times in a table": (
         {"spike_time_s": np.zeros((3, 1))},
         r"spike_time_s: expected one column .* got shape \(3, 1\)",

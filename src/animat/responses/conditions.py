@@ -123,8 +123,9 @@ class ByElectrode(Conditions):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "sets", tuple(tuple(sorted(set(electrodes))) for electrodes in self.sets))
-        if any(not electrodes or electrodes[0] < 0 for electrodes in self.sets):
-            raise InvalidArgument("electrode: expected numbers of electrodes from 0 on, joined by +; got an empty set")
+        if wrong := [electrodes for electrodes in self.sets if not electrodes or electrodes[0] < 0]:
+            got = wrong[0][0] if wrong[0] else "an empty set"
+            raise InvalidArgument(f"electrode: expected numbers of electrodes from 0 on, joined by +; got {got}")
         if len(set(self.sets)) < len(self.sets):
             raise InvalidArgument(f"electrode: expected each set of electrodes once, got {self}")
 
