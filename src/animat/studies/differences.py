@@ -176,15 +176,18 @@ def differing_comparisons(
         yield f"{row.comparison}, {row.robot}", text
 
 
+def too_few_policies(n: int) -> str:
+    """Why no difference can be found with so many policies per side; empty if one can."""
+    smallest = p_of_u(0.0, n, n)
+    policies = counted(n, "policy", "policies")
+    why = f"With {policies} per side p cannot fall below {smallest:.2g}, unless some have equal returns"
+    return "" if smallest < LEVEL else why
+
+
 def explain(row: ComparedReturns) -> str:
     """What the optima say about a comparison's outcome."""
-    n = row.n
-    smallest = p_of_u(0.0, n, n)
-    if smallest >= LEVEL:
-        return (
-            f"With {counted(n, 'policy', 'policies')} per side p cannot fall below {smallest:.2g}, unless some have "
-            "equal returns: use more policies."
-        )
+    if why := too_few_policies(row.n):
+        return f"{why}: use more policies."
     first, second, random = row.optimum_first, row.optimum_second, row.random_second
     if second is None or random is None:
         return "There is no optimum to compare with."

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 from animat.errors import counted
-from animat.evaluation.statistics import p_of_u
 from animat.neurons.fidelity import Fidelity
 from animat.neurons.timeline import load_timeline
 from animat.progress import Progress
@@ -21,7 +20,7 @@ from animat.responses.responses import Responses
 from animat.studies import report_tables
 from animat.studies.arms import arm_differences, arms_table, begin, describe_mapping, summarise_arms
 from animat.studies.captions import BURSTS, CULTURE, HEADLINE, NO_BURSTS, ROBOT, Caption
-from animat.studies.differences import decisions, differing_comparisons
+from animat.studies.differences import decisions, differing_comparisons, too_few_policies
 from animat.studies.folder import MANIFEST, REPORT, RESULTS, TIMELINE
 from animat.studies.outperforming import describe_reflexes, not_outperforming
 from animat.studies.pictures import round_of
@@ -129,12 +128,8 @@ def _summary(study: Study, results: Results, headline: Sequence[Score], picture:
         sentences.append(" ".join([_as_in_paper(printed), *explain]))
     elif rows:
         sentences.append(_found_better(rows))
-    smallest = p_of_u(0.0, study.policies, study.policies)
-    if rows and smallest >= LEVEL:
-        sentences.append(
-            f"With {counted(study.policies, 'policy', 'policies')} per side p cannot fall below {smallest:.2g}, unless "
-            "some have equal returns: this is a first look, not a result."
-        )
+    if rows and (why := too_few_policies(study.policies)):
+        sentences.append(f"{why}: this is a first look, not a result.")
     return Section("Results in short", tuple(sentences), pictures=(picture,), tables=(arms_table(study),))
 
 

@@ -81,8 +81,13 @@ class Fit(StudyTask):
     def make(self, folder: Path, progress: Progress) -> list[Path]:
         study, series = self.study, read_series(self.study, folder)
         timeline = fit_simulators(study, series)
-        noticed = *timeline.findings, *_moved(study, timeline.start_min.tolist()), *_no_memory(timeline)
-        timeline = replace(timeline, findings=noticed)
+        noticed = [*timeline.findings, *_moved(study, timeline.start_min.tolist())]
+        presentation = timeline.presentation
+        # Recordings in blocks, as the paper's, cannot be simulated with memory.
+        if presentation is None or presentation.order != "blocked":
+            has_memory, setting = timeline.fitted["kind"] == "memory", 'simulators.kind = "memory"'
+            noticed += no_memory(timeline.findings, presentation, has_memory=has_memory, setting=setting)
+        timeline = replace(timeline, findings=tuple(noticed))
         return [save_timeline(timeline, folder / TIMELINE), _write_responses(folder / RESPONSES, series)]
 
 
@@ -116,17 +121,6 @@ def _write_responses(path: Path, series: list[Responses]) -> Path:
     )
     head = ("start_min", "condition", "rate_hz", "active_ratio", "is_burst")
     return write_table(path, [*head, *(f"rate_hz of {name}" for name in names)], rows)
-
-
-def _no_memory(timeline: SimulatorTimeline) -> Iterator[Finding]:
-    """A warning if the simulators, of the study's kind, lack the memory that the recordings show.
-
-    Recordings in blocks, as the paper's, cannot be simulated with memory.
-    """
-    presentation = timeline.presentation
-    if presentation is None or presentation.order != "blocked":
-        has_memory, setting = timeline.fitted["kind"] == "memory", 'simulators.kind = "memory"'
-        yield from no_memory(timeline.findings, presentation, has_memory=has_memory, setting=setting)
 
 
 def _moved(study: Study, start_min: list[float]) -> Iterator[Finding]:
