@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 
@@ -132,28 +133,30 @@ def _run_side_by_side(
     runs: Mapping[str, Callable[..., StudyRun]], at_once: int, shared: Executor | None, progress: Progress
 ) -> tuple[dict[str, StudyRun], dict[str, str]]:
     """Run studies, `at_once` at a time; returns the finished ones and the errors of the others, in their order."""
-    ended = set[str]()
+    ended, shares = set[str](), dict.fromkeys(runs, 0.0)
     reporting, stopped = threading.Lock(), threading.Event()
 
-    def report() -> None:
+    def report(name: str, done: float, total: float = 1.0, note: str = "") -> None:
         if stopped.is_set():
             # This ends the study that reports.
             raise AnimatError("stopped")
         with reporting:
-            running = [(name, share.done) for name, share in shares.items() if share.done and name not in ended]
-            parts = [f"{len(ended)} of {len(runs)} cultures", *(f"{name} {100 * done:.0f} %" for name, done in running)]
-            progress.update(len(ended) + sum(done for _, done in running), len(runs), "; ".join(parts))
+            shares[name] = done / total
+            running = {each: share for each, share in shares.items() if share and each not in ended}
+            parts = [f"{len(ended)} of {len(runs)} cultures"]
+            parts += [f"{each} {100 * share:.0f} %" for each, share in running.items()]
+            progress.update(len(ended) + sum(running.values()), len(runs), "; ".join(parts))
 
-    shares = {name: _Share(report) for name in runs}
     with ThreadPoolExecutor(min(at_once, len(runs)), "culture") as threads:
-        futures = {threads.submit(run, progress=shares[name]): name for name, run in runs.items()}
+        of_each = {name: SimpleNamespace(update=partial(report, name)) for name in runs}
+        futures = {threads.submit(run, progress=of_each[name]): name for name, run in runs.items()}
         try:
             for future in as_completed(futures):
                 if not isinstance(future.exception(), AnimatError):
                     future.result()
                 with reporting:
                     ended.add(futures[future])
-                report()
+                report(futures[future], 1.0)
         except BaseException:
             stopped.set()
             threads.shutdown(wait=False, cancel_futures=True)
@@ -164,18 +167,6 @@ def _run_side_by_side(
     errors = {name: future.exception() for future, name in futures.items()}
     finished = {name: future.result() for future, name in futures.items() if errors[name] is None}
     return finished, {name: str(error) for name, error in errors.items() if error is not None}
-
-
-class _Share:
-    """The progress of one of several studies, which reports them all together."""
-
-    def __init__(self, report: Callable[[], None]) -> None:
-        self.done = 0.0
-        self._report = report
-
-    def update(self, done: float, total: float, note: str = "") -> None:
-        self.done = done / total
-        self._report()
 
 
 def over_cultures(comparisons: Sequence[Sequence[ComparedReturns]]) -> Iterator[OverCultures]:
