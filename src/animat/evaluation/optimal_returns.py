@@ -58,7 +58,7 @@ class WellSampled:
         fitted = {name: timeline.fitted[name] for name in ("bins", "range_hz") if timeline.fitted.get(name) is not None}
 
         def fit(these: Responses, kind: str) -> NeuronSimulator:
-            made = fit_simulator(these, kind=kind, **(fitted if kind == "histogram" else {}))
+            made = fit_simulator(these, kind=kind, **fitted)
             return replace(made, percentiles=of_all) if percentiles == "first" or left_out else made  # type: ignore[type-var]
 
         if left_out:

@@ -54,10 +54,8 @@ def episode_rows(
     }
     if (outcome := ran.outcome) is not None:
         columns |= {SUCCEEDED: outcome.succeeded.astype(float).ravel(), MARGIN: outcome.margin.ravel()}
-        columns |= {
-            f"{SATISFACTION}{i}": of.ravel()
-            for i, of in enumerate(np.moveaxis(np.asarray(outcome.satisfaction), -1, 0))
-        }
+        of_each = np.asarray(outcome.satisfaction).reshape(actor.size, -1).T
+        columns |= {f"{SATISFACTION}{i}": satisfied for i, satisfied in enumerate(of_each)}
     return DataFrame(columns)
 
 
