@@ -90,6 +90,12 @@ def test_a_culture_is_one_or_many_and_not_both(given: dict[str, Any], message: s
         Source(**given)
 
 
+def test_a_study_of_a_single_culture_is_refused_before_its_folder_is_made(tmp_path: Path) -> None:
+    with pytest.raises(InvalidArgument, match="culture: expected many, by seeds or folders, got a single one"):
+        run_over_cultures(read_study(TINY), tmp_path / "study")
+    assert not (tmp_path / "study").exists()
+
+
 def test_policies_on_two_cultures_are_independent(tmp_path: Path) -> None:
     study = replace(read_study(TINY), culture=Source(seeds="1-40"))
     files = replace(study, culture=Source(kind="files", folders=("day-1", "day-2")))

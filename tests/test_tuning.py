@@ -64,6 +64,17 @@ class Ends(ThreadPoolExecutor):
         return fn(*args, **kwargs)
 
 
+class In64Bits(ThreadPoolExecutor):
+    """Of a user whose program computes in 64 bits."""
+
+    def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
+        def in_64_bits() -> Any:
+            with jax.enable_x64(True):
+                return fn(*args, **kwargs)
+
+        return super().submit(in_64_bits)
+
+
 def run(folder: Path, executor: Executor | None = None, tuning: Tuning | None = None) -> TuningResult:
     """In this process, where programs are compiled once."""
     with ThreadPoolExecutor(1) as own:
@@ -207,6 +218,13 @@ def test_a_diverging_trial_is_reported_and_leaves_the_others_finite(tmp_path: Pa
         assert (each.state == "diverged") == (each.settings["learning_rate"] == 1e38)
     assert {each.state for each in trials} >= {"complete", "diverged"}
     assert trials[0].state == "complete"
+
+
+@pytest.mark.oracle
+def test_where_programs_compute_in_64_bits_trials_learn_the_same(finished: Path, tmp_path: Path) -> None:
+    with In64Bits(1) as executor:
+        run(tmp_path, executor)
+    assert left(tmp_path) == left(finished)
 
 
 @pytest.mark.oracle

@@ -74,7 +74,12 @@ def first_difference(
         pairs = [(one, other, f"{name}[{i}]") for i, (one, other) in enumerate(zip(found, wanted, strict=False))]
         pairs += [(len(found), len(wanted), f"{name}, how many")]
     else:
-        return "" if found == wanted else f"{name}: {_short(found)} there, {_short(wanted)} now"
+        # 1 and 1.0 are equal, but written differently, as fingerprints notice.
+        return (
+            ""
+            if found == wanted and type(found) is type(wanted)
+            else f"{name}: {_short(found)} there, {_short(wanted)} now"
+        )
     keys: dict[str, Any] = {"ignoring": ignoring, "first": first}
     return next(filter(None, (first_difference(*pair, **keys) for pair in pairs)), "")
 

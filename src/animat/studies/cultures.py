@@ -15,7 +15,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from animat.errors import AnimatError, counted
+from animat.errors import AnimatError, InvalidArgument, counted
 from animat.evaluation.statistics import interval_of_mean
 from animat.execution.cluster import Cluster
 from animat.execution.gpu import find_gpu
@@ -86,6 +86,8 @@ def run_over_cultures(
     expect_workers(workers, executor)
     folder = Path(folder).absolute()
     studies = studies_of(study)
+    if not studies:
+        raise InvalidArgument("culture: expected many, by seeds or folders, got a single one; run_study runs its study")
     # Checked first, so that a folder with other work is not touched.
     expect_no_other(folder, "cultures")
     with exclusive_lock(folder):

@@ -139,6 +139,11 @@ class TrainTrials(StudyTask):
         return tuple(place.as_posix() for place in places)
 
     def make(self, folder: Path, progress: Progress) -> list[Path]:
+        # In 32 bits, even where the user's own code computes in 64, as in other trainings.
+        with jax.enable_x64(False):
+            return self._train(folder, progress)
+
+    def _train(self, folder: Path, progress: Progress) -> list[Path]:
         place, (first, last) = folder / self.place, self.chunks
         studies = [with_settings(self.study, trial.settings) for trial in self.trials]
         algorithms = [SAC(**study.algorithm) for study in studies]  # type: ignore[arg-type]
