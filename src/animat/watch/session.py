@@ -34,8 +34,6 @@ _MOST_RECORDS = 8000
 """Most records in a view: at 80 Hz more than a minute and a half."""
 _GROW_S, _COUNT_S = 0.6, 0.15
 """How long a view may look for new records, and count them; the next view continues."""
-_AGENTS_S, _MANY = 0.5, 500
-"""Interval between updates of the returns by agent, from this many episodes on."""
 _SILENT_S = 5.0
 """After which a session without new records no longer counts as running: it logs every request to a culture."""
 _NO_TIME = 64
@@ -57,8 +55,6 @@ class SessionView(View):
         super().__init__(folder)
         self.tail = Tail(self.file)
         self._generation = -1
-        self._agents: list[dict[str, Any]] = []
-        self._agents_due_s, self._done = 0.0, 0
 
     def close(self) -> None:
         self.tail.close()
@@ -153,23 +149,19 @@ class SessionView(View):
             self._header: Header = read_header(self.file, first.fields)
             self._fields = first.fields
             self._robot = _drawn_robot(first.fields["loop"])
-            self._sums, self._agents_due_s = Sums(self.tail), 0.0
+            self._sums = Sums(self.tail)
             self._generation = self.tail.generation
         return is_whole
 
     def _so_far(self) -> dict[str, Any]:
         sums = self._sums
         outline, fullest = sums.outline, sums.on_electrode.most_common(1)
-        if time.monotonic() >= self._agents_due_s:
-            self._done = sum(episode.is_whole for episode in outline.episodes)
-            self._agents = by_agent(self._header.agents, outline.episodes, self._fields.get("predicted"))
-            # With thousands of episodes, not every time.
-            self._agents_due_s = time.monotonic() + (_AGENTS_S if self._done > _MANY else 0.0)
-        left_s = None
-        if self._done and sums.wall_s is not None:
+        episodes, left_s = outline.episodes, None
+        done = sum(episode.is_whole for episode in episodes)
+        if done and sums.wall_s is not None:
             # The time before the first move is spent only once.
             moving_s = sums.wall_s - (outline.moved_at_s or 0.0)
-            left_s = moving_s * (len(self._fields.get("turns", ())) - self._done) / self._done
+            left_s = moving_s * (len(self._fields.get("turns", ())) - done) / done
         state = self._state()
         return {
             **state,
@@ -184,9 +176,9 @@ class SessionView(View):
             "unanswered": outline.unanswered_pulses,
             "faults": sums.faults,
             "n_faults": sums.n_faults,
-            "episodes_done": self._done,
+            "episodes_done": done,
             "time_left": time_left(left_s, state),
-            "agents": self._agents,
+            "agents": by_agent(self._header.agents, episodes, self._fields.get("predicted")),
         }
 
     def _state(self) -> dict[str, Any]:
