@@ -169,7 +169,7 @@ def read_log(path: str | os.PathLike[str]) -> Log:
         if file.read(len(MAGIC)) != MAGIC:
             raise InvalidFile(f"{path}: expected the log of a closed-loop session, got something else")
         places, n_bytes = array("Q", [len(MAGIC)]), os.fstat(file.fileno()).st_size
-        while (end := _end_of_intact(file, places[-1], n_bytes)) is not None:
+        while (end := end_of_intact(file, places[-1], n_bytes)) is not None:
             places.append(end)
         if len(places) < 2:
             raise InvalidFile(f"{path}: expected the log of a closed-loop session, got one cut off in its first record")
@@ -185,7 +185,7 @@ def open_file(path: Path) -> Iterator[BinaryIO]:
         yield file
 
 
-def _end_of_intact(file: BinaryIO, at: int, n_bytes: int) -> int | None:
+def end_of_intact(file: BinaryIO, at: int, n_bytes: int) -> int | None:
     """Where the record at the file's position `at` ends; None if it is not intact."""
     head = file.read(HEAD.size)
     if len(head) < HEAD.size:

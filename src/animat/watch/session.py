@@ -143,12 +143,11 @@ class SessionView(View):
         """Find new records in the log; False if there are more than could be found in time."""
         is_whole = self.tail.grow(_GROW_S)
         if self._generation != self.tail.generation:
-            first = self.tail.record(0)
-            if first is None:
+            if not len(self.tail):
                 raise InvalidFile(f"{self.file}: expected a log of a session, got one without a whole beginning")
-            self._header: Header = read_header(self.file, first.fields)
-            self._fields = first.fields
-            self._robot = _drawn_robot(first.fields["loop"])
+            self._fields = self.tail.peek(0)
+            self._header: Header = read_header(self.file, self._fields)
+            self._robot = _drawn_robot(self._fields["loop"])
             self._sums = Sums(self.tail)
             self._generation = self.tail.generation
         return is_whole
@@ -185,7 +184,7 @@ class SessionView(View):
         silent_s = max(0.0, time.time() - self.file.stat().st_mtime)
         silent = f"nothing was written for {format_duration(silent_s)}"
         stop = (self.folder / STOP_FILE).exists()
-        last = self.tail.peek(len(self.tail) - 1) or {}
+        last = self.tail.peek(len(self.tail) - 1)
         damage = self.tail.damage
         if last.get("kind") == "end":
             state, message = "ended", text(last.get("message"))
@@ -201,7 +200,7 @@ class SessionView(View):
     def _span_before(self, at: int) -> tuple[float, float] | None:
         """The span of the last record up to `at` that has a time."""
         for earlier in range(at, max(0, at - _NO_TIME), -1):
-            span = _span(self.tail.peek(earlier) or {})
+            span = _span(self.tail.peek(earlier))
             if span is not None:
                 return span
         return None
@@ -216,8 +215,6 @@ class SessionView(View):
         records: list[tuple[int, Record]] = []
         for at in range(bisect_right(range(1, len(self.tail)), to_s, key=start_s), 0, -1):
             record = self.tail.record(at)
-            if record is None:
-                continue
             span = _span(record.fields)
             if (span is not None and span[1] < from_s) or len(records) >= _MOST_RECORDS:
                 break
@@ -225,8 +222,7 @@ class SessionView(View):
         return records[::-1]
 
     def _tick_of(self, at: int) -> dict[str, Any] | None:
-        record = self.tail.record(at)
-        return None if record is None else record.fields.get("tick") or None
+        return self.tail.record(at).fields.get("tick") or None if 0 <= at < len(self.tail) else None
 
     def _tick(self, at: int, record: Record) -> dict[str, Any]:
         tick, totals = record.fields["tick"], self._sums.totals

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import os
 import time
-import zlib
 from array import array
 from collections import Counter
 from collections.abc import Sequence
@@ -14,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from animat.closed_loop.log import HEAD, MAGIC, RECORD, Record, parse_fields, parse_record
+from animat.closed_loop.log import HEAD, MAGIC, RECORD, Record, end_of_intact, parse_fields, parse_record
 from animat.closed_loop.outline import Episode, Outline
 from animat.errors import InvalidFile
 from animat.evaluation.statistics import interval_of_mean
@@ -23,7 +22,7 @@ from animat.watch.files import mapped, number, numbers, text
 _KEPT = 4096
 """Number of records kept in memory: those of the last seconds are requested again and again."""
 _MOST_BYTES = 2**26
-"""Most bytes of a record: a damaged length must not cause gigabytes to be read."""
+"""Most bytes of a record: one that seems to be longer has a damaged length."""
 _BLOCK_BYTES = 2**20
 _LOOKS = 64
 """Records between two looks at the clock."""
@@ -47,10 +46,16 @@ class Tail:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.generation = 0
+        self.generation = -1
         self.damage = ""
         self._file: int | None = None
         self._begin()
+
+    def _begin(self) -> None:
+        self._places = array("Q", [len(MAGIC)])
+        self._kept: dict[int, Record] = {}
+        # Of the file, when its records were last found.
+        self._size = 0
 
     def __len__(self) -> int:
         return len(self._places) - 1
@@ -63,62 +68,41 @@ class Tail:
     def grow(self, within_s: float) -> bool:
         """Find the records that were added; False if time ran out; raises InvalidFile if the file is not a log."""
         size = self._open()
+        if size == self._size:
+            return True
         assert self._file is not None
-        until_s, place = time.monotonic() + within_s, self._places[-1]
-        self.damage, n_found = "", 0
-        # Read in blocks: reading each head by itself takes three times as long.
-        block, begin = b"", place
-        while place + HEAD.size <= size:
-            if place + HEAD.size > begin + len(block):
-                begin, block = place, os.pread(self._file, _BLOCK_BYTES, place)
-                if len(block) < HEAD.size:
-                    break
-            mark, fields_size, n_spikes, _ = HEAD.unpack_from(block, place - begin)
-            end = place + HEAD.size + fields_size + 12 * n_spikes
-            if mark != RECORD or end - place > _MOST_BYTES or place == self._damaged_at:
-                self.damage = f"{size - place:,} bytes after the last whole record are damaged"
-                break
-            if end > size:
-                break
-            self._places.append(end)
-            place, n_found = end, n_found + 1
-            if n_found % _LOOKS == 0 and time.monotonic() > until_s:
-                return False
-        if place < size and not self.damage:
-            self.damage = f"{size - place:,} bytes after the last whole record are of a truncated one"
+        self.damage, until_s = "", time.monotonic() + within_s
+        with os.fdopen(self._file, "rb", _BLOCK_BYTES, closefd=False) as file:
+            file.seek(self._places[-1])
+            while (end := end_of_intact(file, self._places[-1], size)) is not None:
+                self._places.append(end)
+                if len(self) % _LOOKS == 0 and time.monotonic() > until_s:
+                    return False
+        self._size = size
+        if left := size - self._places[-1]:
+            head, is_truncated = os.pread(self._file, HEAD.size, self._places[-1]), True
+            if len(head) == HEAD.size:
+                mark, n_fields, n_spikes, _ = HEAD.unpack(head)
+                is_truncated = mark == RECORD and left < HEAD.size + n_fields + 12 * n_spikes <= _MOST_BYTES
+            what = "of a truncated one" if is_truncated else "damaged"
+            self.damage = f"{left:,} bytes after the last whole record are {what}"
         return True
 
-    def record(self, at: int) -> Record | None:
-        """A record; None if it is not whole, in which case the log ends before it."""
+    def record(self, at: int) -> Record:
+        """A record, kept for the next time."""
         if at not in self._kept:
-            data = self._data(at)
-            if data is None:
-                return None
             if len(self._kept) >= _KEPT:
                 del self._kept[next(iter(self._kept))]
-            self._kept[at] = parse_record(self.path, data)
+            self._kept[at] = parse_record(self.path, self._data(at))
         return self._kept[at]
 
-    def peek(self, at: int) -> dict[str, Any] | None:
-        """The fields of a record, without keeping it; None if it is not whole."""
-        if at in self._kept:
-            return self._kept[at].fields
-        data = self._data(at)
-        return None if data is None else parse_fields(self.path, data)
+    def peek(self, at: int) -> dict[str, Any]:
+        """The fields of a record, without keeping it."""
+        return self._kept[at].fields if at in self._kept else parse_fields(self.path, self._data(at))
 
-    def _data(self, at: int) -> bytes | None:
-        """The bytes of a record, if their checksum is right; otherwise the log ends before it."""
-        if self._file is None or not 0 <= at < len(self):
-            return None
-        place, end = self._places[at], self._places[at + 1]
-        data = os.pread(self._file, end - place, place)
-        if len(data) == end - place and zlib.crc32(memoryview(data)[HEAD.size :]) == HEAD.unpack_from(data)[3]:
-            return data
-        self._damaged_at = place
-        self.damage = f"{self._places[-1] - place:,} bytes after the last whole record are damaged"
-        del self._places[at + 1 :]
-        self._kept.clear()
-        return None
+    def _data(self, at: int) -> bytes:
+        assert self._file is not None
+        return os.pread(self._file, self._places[at + 1] - self._places[at], self._places[at])
 
     def _open(self) -> int:
         """Open the file, or reopen it if it was replaced; returns its size."""
@@ -128,23 +112,18 @@ class Tail:
                 ours = os.fstat(self._file)
                 if (ours.st_ino, ours.st_dev) != (status.st_ino, status.st_dev) or status.st_size < self._places[-1]:
                     self.close()
-                    self._begin()
-                    self.generation += 1
             if self._file is None:
                 # A pipe of this name would block, and a link may lead anywhere.
                 self._file = os.open(self.path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW | os.O_CLOEXEC)
                 if os.pread(self._file, len(MAGIC), 0) != MAGIC:
                     self.close()
                     raise InvalidFile(f"{self.path}: expected the log of a closed-loop session, got something else")
+                self._begin()
+                self.generation += 1
         except OSError as error:
             self.close()
             raise InvalidFile(f"{self.path}: cannot be read: {error.strerror or error}") from error
         return status.st_size
-
-    def _begin(self) -> None:
-        self._places = array("Q", [len(MAGIC)])
-        self._kept: dict[int, Record] = {}
-        self._damaged_at = -1
 
 
 class Sums:
@@ -171,11 +150,8 @@ class Sums:
         """Count the records that were added, for at most `within_s`."""
         until_s = time.monotonic() + within_s
         while self.counted < len(self._tail):
-            record = self._tail.peek(self.counted)
-            if record is None:
-                return
             try:
-                self.totals.append(self._add(record))
+                self.totals.append(self._add(self._tail.peek(self.counted)))
             except (KeyError, TypeError, ValueError, IndexError, ArithmeticError, AttributeError):
                 self.totals.append(math.nan)
                 self.strange += 1
