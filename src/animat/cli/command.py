@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from animat.cultures.budget import Account
     from animat.neurons.timeline import SimulatorTimeline
     from animat.responses.readouts import Readouts
+    from animat.robots.base import Robot
     from animat.studies.specification import RobotSpec
     from animat.training.policy import Policy
     from animat.training.settings import SAC
@@ -259,6 +260,19 @@ def figure_format(given: str | None, out: Path | None) -> Any:
     if given is not None and out is None:
         raise InvalidArgument(f"--format: expected only with --out, as no figures are drawn, got {given}")
     return given or "png"
+
+
+def robot_for(name: str, goal: str | None = None, /, **parameters: float) -> Robot[Any]:
+    """A robot by its name, checked if it is not one of ours, with a goal in place of its own task if one is given."""
+    from animat.goals.robot import with_goal
+    from animat.registry import is_ours
+    from animat.robots.checking import check_robot
+    from animat.robots.registry import robot_named
+
+    robot = robot_named(name, **parameters)
+    if not is_ours(robot):
+        check_robot(robot)
+    return robot if goal is None else with_goal(robot, goal)
 
 
 def policies_for(robot: str | None, mapping: str | None, path: Path) -> dict[str, Policy]:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional
 
-from animat.cli.command import StimulationOptions, expect_no_fault, read_sac
+from animat.cli.command import StimulationOptions, expect_no_fault, read_sac, robot_for
 from animat.errors import InvalidArgument, counted
 from animat.writing import exclusive_lock
 
@@ -70,14 +70,10 @@ class Live(StimulationOptions):
         from animat.coding.mapping import mapping_named
         from animat.compilation import keep_compilations
         from animat.cultures.kinds import culture_of, pulse_for
-        from animat.goals.robot import with_goal
         from animat.live.plan import Timetable, check_plan
         from animat.live.shadowing import live
         from animat.progress import Bar
         from animat.recordings.reading import read_recordings
-        from animat.registry import is_ours
-        from animat.robots.checking import check_robot
-        from animat.robots.registry import robot_named
         from animat.stimulation.protocol import Protocol, read_protocol
         from animat.training.specification import Training
 
@@ -92,10 +88,7 @@ class Live(StimulationOptions):
         self._check_culture_seed()
         speed = (30.0 if simulated else 1.0) if self.speed is None else self.speed
         timetable = Timetable(self.interval_min, self.duration_min, speed)
-        robot = robot_named(self.robot)
-        if not is_ours(robot):
-            check_robot(robot)
-        robot = robot if self.goal is None else with_goal(robot, self.goal)
+        robot = robot_for(self.robot, self.goal)
         training = Training(
             robot,
             mapping_named(self.mapping),

@@ -7,7 +7,7 @@ from typing import Any
 
 from tyro.conf import Positional
 
-from animat.cli.command import Command
+from animat.cli.command import Command, robot_for
 
 
 @dataclass(frozen=True)
@@ -49,15 +49,11 @@ class Robots(Command):
 
 
 def _describe(name: str) -> dict[str, Any]:
-    from animat.registry import is_ours
-    from animat.robots import robot_named, robot_to_dict
+    from animat.robots import robot_to_dict
     from animat.robots.base import WITHOUT, lacking
-    from animat.robots.checking import check_robot
     from animat.robots.gymnasium import GymnasiumRobot
 
-    robot = robot_named(name)
-    if not is_ours(robot):
-        check_robot(robot)
+    robot = robot_for(name)
     lacks, parameters = lacking(robot), robot_to_dict(robot)["parameters"]
     if isinstance(robot, GymnasiumRobot):
         # Its others are what was found in the environment.

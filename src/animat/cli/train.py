@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional
 
-from animat.cli.command import JobOptions, SimulatorOptions, print_warnings, read_numbers, read_sac
+from animat.cli.command import JobOptions, SimulatorOptions, print_warnings, read_numbers, read_sac, robot_for
 from animat.errors import InvalidArgument, UnusableData, counted, expect_at_least, in_file, in_min
 from animat.recordings.findings import Finding
 from animat.records import as_json
@@ -121,25 +121,18 @@ class Train(SimulatorOptions, JobOptions):
     def _training(self) -> tuple[Training, str | Readouts]:
         from animat.coding.decoder import expect_fit
         from animat.coding.mapping import mapping_named
-        from animat.goals.robot import with_goal
-        from animat.registry import is_ours
         from animat.responses.readouts import ALL, DEFAULT_READOUTS, count_readouts, read_readouts
-        from animat.robots.checking import check_robot
-        from animat.robots.registry import robot_named
         from animat.training.lessons import expect_lessons, read_lessons
         from animat.training.specification import Training
 
         parameters = read_numbers("--parameters", self.parameters)
         try:
-            robot = robot_named(self.robot, **parameters)
+            robot = robot_for(self.robot, self.goal, **parameters)
         except InvalidArgument as error:
             # The message about an unknown robot begins otherwise.
             if not parameters or not str(error).startswith(f"{self.robot}: "):
                 raise
             raise InvalidArgument(f"--parameters: {error}") from error
-        if not is_ours(robot):
-            check_robot(robot)
-        robot = robot if self.goal is None else with_goal(robot, self.goal)
         usual = _PAPER if self.paper else _USUAL
         mapping = self.mapping or usual["mapping"]
         usual_readouts = "all" if mapping == "none" else DEFAULT_READOUTS.get(robot.n_commands, "all")
