@@ -13,6 +13,7 @@ from animat.plain_file import expect_plain_file
 from animat.recordings.formats.npz import UNDER_WAY
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
+from animat.report.array import rates_of_sites
 from animat.responses.inspection import Inspection, inspect_recording
 from animat.watch.discovery import is_locked, recordings_in
 from animat.watch.files import packed, text
@@ -131,11 +132,10 @@ def _raster(recording: Recording, to_s: float | None, span_s: float) -> tuple[di
 
 
 def _rates(recording: Recording) -> dict[str, Any]:
-    counts = np.bincount(recording.spike_channels, minlength=len(recording.channels))
-    rates_hz = np.sort(counts / max(recording.duration_s, 1e-9))[::-1]
+    rates_hz = np.sort(rates_of_sites(recording))[::-1]
     line = curve("", np.arange(1, len(rates_hz) + 1).tolist(), rates_hz.tolist(), "line", "blue")
     median = float(np.median(rates_hz)) if len(rates_hz) else 0.0
-    note = f"Firing rate, the most active channel first; median {median:.2f} Hz, {int((counts == 0).sum())} silent"
+    note = f"Firing rate, the most active channel first; median {median:.2f} Hz, {int((rates_hz == 0).sum())} silent"
     return chart("Rates of channels", "channels, by rate", "Hz", [line], note, width="half")
 
 

@@ -76,22 +76,20 @@ class TrainingView(View):
     def _learned(self, planned: int, progress: JobProgress) -> tuple[Curves, dict[int, float]]:
         """The learning curve of each policy by its number, and the share of its training that is done."""
         curves: Curves = {}
-        shares = dict.fromkeys(range(planned), 0.0)
         # Checkpoints of groups on cores, and of all policies trained together on a GPU.
         unfinished = self.folder / UNFINISHED
         for path in (*unfinished.glob("from-p*.npz"), *unfinished.glob("at-once-*.npz")):
-            for i, rows in (self._content(path, _curves_of_checkpoint) or {}).items():
-                curves[i], shares[i] = rows, min(1.0, len(rows) / _CHUNKS)
+            curves |= self._content(path, _curves_of_checkpoint) or {}
+        shares = {i: min(1.0, len(curves.get(i, ())) / _CHUNKS) for i in range(planned)}
         for name, (share, _) in progress.items():
             members = re.fullmatch(r"p(\d{1,6})(?: to p(\d{1,6}))?", name)
             if members is not None:
                 last = min(int(members[2] or members[1]), planned - 1)
                 shares |= {i: max(shares[i], min(share, 1.0)) for i in range(int(members[1]), last + 1)}
-        for i in range(planned):
+        for i in shares:
             if (rows := self._content(self.folder / f"p{i}.safetensors", _curve_of_policy)) is not None:
                 curves[i], shares[i] = rows, 1.0
-        known = range(planned)
-        return {i: curves[i] for i in known if i in curves}, {i: shares[i] for i in known}
+        return {i: curves[i] for i in shares if i in curves}, shares
 
     def _content(self, path: Path, read: Any) -> Any:
         """The content of a file, read again only if it changed; None if there is none."""
