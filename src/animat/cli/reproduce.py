@@ -31,12 +31,10 @@ class Reproduce(JobOptions):
         seeds = read_seeds(self.culture_seed)
         if self.study == "context":
             return self._context(seeds)
-        study = paper_study(1, self.seed, quick=self.quick)
-        if len(seeds) == 1:
-            culture = replace(study.culture, seed=seeds[0])
-        else:
-            culture = replace(study.culture, seeds=self.culture_seed)
-        return run_and_report(replace(study, culture=culture), Path(), self)
+        study = paper_study(seeds[0] if len(seeds) == 1 else 1, self.seed, quick=self.quick)
+        if len(seeds) > 1:
+            study = replace(study, culture=replace(study.culture, seeds=self.culture_seed))
+        return run_and_report(study, Path(), self)
 
     def _context(self, cultures: list[int]) -> dict[str, Any]:
         from animat.studies.context import ContextStudy, quick_context_study, run_context_study

@@ -130,7 +130,7 @@ class Sums:
     """The totals of a log's records counted so far; `strange` are those that are not understood.
 
     Attributes:
-        totals: for each record the return of its episode so far; NaN without a tick.
+        totals: for each record counted the return of its episode so far; NaN without a tick.
         wall_s: of the last tick, on the program's clock; None before the first.
         faults: the last ones: when, on the session's clock, and what happened.
     """
@@ -138,7 +138,7 @@ class Sums:
     def __init__(self, tail: Tail) -> None:
         self._tail = tail
         self.outline = Outline()
-        self.counted = self.strange = self.n_faults = 0
+        self.strange = self.n_faults = 0
         self.totals = array("d")
         self.wall_s: float | None = None
         self.on_electrode: Counter[int] = Counter()
@@ -149,20 +149,19 @@ class Sums:
     def go_on(self, within_s: float) -> None:
         """Count the records that were added, for at most `within_s`."""
         until_s = time.monotonic() + within_s
-        while self.counted < len(self._tail):
+        while len(self.totals) < len(self._tail):
             try:
-                self.totals.append(self._add(self._tail.peek(self.counted)))
+                self.totals.append(self._add(self._tail.peek(len(self.totals))))
             except (KeyError, TypeError, ValueError, IndexError, ArithmeticError, AttributeError):
                 self.totals.append(math.nan)
                 self.strange += 1
-            self.counted += 1
-            if self.counted % _LOOKS == 0 and time.monotonic() > until_s:
+            if len(self.totals) % _LOOKS == 0 and time.monotonic() > until_s:
                 return
 
     @property
     def share(self) -> float:
         """The share of the log's records that are counted."""
-        return self.counted / max(1, len(self._tail))
+        return len(self.totals) / max(1, len(self._tail))
 
     def _add(self, fields: dict[str, Any]) -> float:
         """Count a record; returns the total of its episode."""
