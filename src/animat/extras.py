@@ -20,11 +20,10 @@ def pip_install(requirement: str) -> str:
     return f"{shlex.quote(sys.executable)} -m pip install '{requirement}'"
 
 
-def expect_extra(module: str, *, package: str, extra: str, argument: str) -> Any:
-    """Import a module that an extra installs; the AnimatError if it is missing names the argument that needs it."""
+def expect_extra(module: str, *, package: str, extra: str) -> Any:
+    """Import a module; the AnimatError if it is missing begins with its extra, as the argument that needs it does."""
     try:
         return importlib.import_module(module)
     except ImportError as error:
-        raise AnimatError(
-            f"{argument}: expected the package {package}, which is not installed: {install_command(extra)}"
-        ) from error
+        missing = f"expected the package {package}, which is not installed: {install_command(extra)}"
+        raise AnimatError(f"{extra}: {missing}") from error

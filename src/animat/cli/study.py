@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from tyro.conf import Positional
 
-from animat.cli.command import JobOptions
+from animat.cli.command import JobOptions, print_warnings
 from animat.columns import align_columns
 from animat.errors import AnimatError, counted
 
@@ -40,7 +40,6 @@ def run_and_report(study: Study, base: Path, command: JobOptions) -> dict[str, A
 
 
 def _run_one(study: Study, base: Path, command: JobOptions) -> dict[str, Any]:
-    from animat.recordings.findings import warnings_once
     from animat.report.results import Results
     from animat.studies.folder import RESULTS
     from animat.studies.outperforming import not_outperforming
@@ -61,8 +60,7 @@ def _run_one(study: Study, base: Path, command: JobOptions) -> dict[str, Any]:
     messages = not_outperforming(results)
     for message in messages:
         print(message)
-    for message in warnings_once(results.findings):
-        print(f"warning: {message}", file=sys.stderr)
+    print_warnings(results.findings)
     done, n = f"all {ran.jobs} jobs are done", len(ran.done_now)
     now = f"{done}, {n} of them now, in {time.monotonic() - began:.0f} s" if n else f"nothing to do: {done}"
     print(f"{now}; report: {ran.report}")

@@ -41,7 +41,7 @@ runpy.run_module(sys.argv.pop(1), run_name="__main__", alter_sys=True)
 
 def expect_distributed() -> Any:
     """Import Dask's package for clusters; raises AnimatError if it is not installed."""
-    return expect_extra("distributed", package="Dask", extra="cluster", argument="cluster")
+    return expect_extra("distributed", package="Dask", extra="cluster")
 
 
 @final

@@ -22,7 +22,7 @@ class TensorBoard:
     """
 
     def __init__(self, folder: str | Path) -> None:
-        board = expect_extra("tensorboardX", package="tensorboardX", extra="tensorboard", argument="tensorboard")
+        board = expect_extra("tensorboardX", package="tensorboardX", extra="tensorboard")
         self._make, self._folder = board.SummaryWriter, Path(folder)
         self._writers: dict[str, Any] = {}
 

@@ -162,4 +162,4 @@ def _is_mirrored(name: str, among: Range | tuple[Value, ...]) -> bool:
 
 def expect_optuna() -> Any:
     """Import Optuna; raises AnimatError if it is not installed."""
-    return expect_extra("optuna", package="Optuna", extra="tune", argument="tune")
+    return expect_extra("optuna", package="Optuna", extra="tune")
