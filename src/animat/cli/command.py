@@ -211,7 +211,9 @@ class SimulatorOptions(ResponseOptions):
             if option.name in _OF_SIMULATORS and value != option.default:
                 # A folder may have the name of an option, such as `recordings`.
                 name = option.name.replace("_", "-")
-                raise InvalidArgument(f"--{name}: expected none {where}, got {_typed(value)}")
+                several = value if isinstance(value, tuple) else (value,)
+                typed = " ".join(f"{each:g}" if isinstance(each, float) else str(each) for each in several)
+                raise InvalidArgument(f"--{name}: expected none {where}, got {typed}")
 
 
 _OF_SIMULATORS = (
@@ -219,12 +221,6 @@ _OF_SIMULATORS = (
     *("simulator", "bins", "range_hz", "recordings", "at_min", "duration_min", "percentiles", "delivery"),
 )
 """Options that choose simulators, or how they are made and used."""
-
-
-def _typed(value: Any) -> str:
-    """An option's value as on the command line."""
-    several = value if isinstance(value, tuple) else (value,)
-    return " ".join(f"{each:g}" if isinstance(each, float) else str(each) for each in several)
 
 
 def simulator_settings(

@@ -60,20 +60,26 @@ class SessionView(View):
         self.tail.close()
 
     def picture(self, at: int) -> bytes | None:
-        """A PNG of the robot at a record; None without a tick there, or for a robot that cannot be drawn here."""
+        """A PNG of the robot at a record; None without a tick there or any observation, or if it cannot be drawn."""
         with self._reading():
             self._look()
             tick = self._tick_of(at)
             if tick is None or self._robot is None:
                 return None
-            earlier: list[Any] = []
-            for before in range(at - 1, max(-1, at - _TRAIL), -1):
-                past = self._tick_of(before)
-                if past is not None and past["episode"] != tick["episode"]:
-                    break
-                if past is not None and past["observation"]:
-                    earlier.append(past["observation"])
-            return _picture_of(self._robot, tick, earlier[::-1])
+            before = filter(None, map(self._tick_of, range(at - _TRAIL + 1, at)))
+            own = [past["observation"] for past in before if past["episode"] == tick["episode"]]
+            earlier = [np.array(observation, np.float64) for observation in own if observation]
+            if not tick["observation"] and not earlier:
+                return None
+            picture = draw_robot(
+                self._robot,
+                np.array(tick["observation"] or earlier[-1], np.float64),
+                command=np.array(tick["command"] or 0.0, np.float64)[()],
+                earlier=earlier,
+            )
+            png = io.BytesIO()
+            Image.fromarray(picture).save(png, "PNG", compress_level=1)
+            return png.getvalue()
 
     def _title(self) -> str:
         fields = self._fields
@@ -279,19 +285,3 @@ def _drawn_robot(loop: dict[str, Any]) -> Robot[Any] | None:
     except Exception:  # a robot of a third party may raise anything
         return None
     return robot if hasattr(robot, "draw") else None
-
-
-def _picture_of(robot: Robot[Any], tick: dict[str, Any], earlier: Sequence[Any]) -> bytes | None:
-    """A PNG of a robot at a tick with the earlier observations of its episode; None if nothing has been observed."""
-    observation = tick["observation"] or (earlier[-1] if earlier else None)
-    if not observation:
-        return None
-    picture = draw_robot(
-        robot,
-        np.array(observation, np.float64),
-        command=np.array(tick["command"] or 0.0, np.float64)[()],
-        earlier=[np.array(past, np.float64) for past in earlier],
-    )
-    png = io.BytesIO()
-    Image.fromarray(picture).save(png, "PNG", compress_level=1)
-    return png.getvalue()
