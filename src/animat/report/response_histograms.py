@@ -69,11 +69,10 @@ def draw_response_histograms(responses: Responses, last: Responses | None = None
         # The lowest panel has labels even if its column is not full.
         panels[min((column + 1) * rows, max(len(drawn), 1)) - 1].tick_params(labelbottom=True)
     figure.supxlabel(_RATE, fontsize=9)
-    left_out = [beyond] if beyond else []
-    if more := len(n) - len(drawn):
-        left_out.insert(0, f"the {len(drawn)} conditions with the most responses; {more} more are not drawn")
-    if left_out:
-        figure.suptitle("\n".join(left_out), fontsize=9)
+    more = len(n) - len(drawn)
+    few = f"the {len(drawn)} conditions with the most responses; {more} more are not drawn" if more else ""
+    if few or beyond:
+        figure.suptitle("\n".join(filter(None, [few, beyond])), fontsize=9)
     return figure
 
 
@@ -113,15 +112,10 @@ def draw_responses_over_time(series: Sequence[Responses]) -> Figure:
         style_axes(axes, title, "", "start (min)" if i % columns == 0 else "")
     for axes in panels[len(conditions) :]:
         axes.set_visible(False)
-    left_out = []
-    if len(shown) < len(series):
-        left_out.append(f"{len(shown)} of {len(series)} recordings")
-    if len(conditions) < len(shown[0].conditions):
-        left_out.append(f"{len(conditions)} of {len(shown[0].conditions)} conditions")
-    if beyond:
-        left_out.append(beyond)
-    if left_out:
-        figure.suptitle(", ".join(left_out), fontsize=10)
+    numbers = ("recordings", len(shown), len(series)), ("conditions", len(conditions), len(shown[0].conditions))
+    left_out = [f"{n} of {every} {what}" for what, n, every in numbers if n < every]
+    if left_out or beyond:
+        figure.suptitle(", ".join(filter(None, [*left_out, beyond])), fontsize=10)
     figure.supxlabel(_RATE, fontsize=9)
     return figure
 
