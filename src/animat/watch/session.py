@@ -190,7 +190,7 @@ class SessionView(View):
         silent_s = max(0.0, time.time() - self.file.stat().st_mtime)
         silent = f"nothing was written for {format_duration(silent_s)}"
         stop = (self.folder / STOP_FILE).exists()
-        last = self.tail.peek(len(self.tail) - 1)
+        last = self.tail.record(len(self.tail) - 1).fields
         damage = self.tail.damage
         if last.get("kind") == "end":
             state, message = "ended", text(last.get("message"))
@@ -206,7 +206,7 @@ class SessionView(View):
     def _span_before(self, at: int) -> tuple[float, float] | None:
         """The span of the last record up to `at` that has a time."""
         for earlier in range(at, max(0, at - _NO_TIME), -1):
-            span = _span(self.tail.peek(earlier))
+            span = _span(self.tail.record(earlier).fields)
             if span is not None:
                 return span
         return None

@@ -8,6 +8,7 @@ import time
 from array import array
 from collections import Counter
 from collections.abc import Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +43,7 @@ class Tail:
     Attributes:
         generation: changes when the file is replaced or becomes shorter.
         damage: a message on unreadable bytes after the last whole record; empty if there are none.
+        record: gives a record by its place, and keeps the last ones.
     """
 
     def __init__(self, path: Path) -> None:
@@ -53,9 +55,9 @@ class Tail:
 
     def _begin(self) -> None:
         self._places = array("Q", [len(MAGIC)])
-        self._kept: dict[int, Record] = {}
         # Of the file, when its records were last found.
         self._size = 0
+        self.record = lru_cache(_KEPT)(self._record)
 
     def __len__(self) -> int:
         return len(self._places) - 1
@@ -88,17 +90,12 @@ class Tail:
             self.damage = f"{left:,} bytes after the last whole record are {what}"
         return True
 
-    def record(self, at: int) -> Record:
-        """A record, kept for the next time."""
-        if at not in self._kept:
-            if len(self._kept) >= _KEPT:
-                del self._kept[next(iter(self._kept))]
-            self._kept[at] = parse_record(self.path, self._data(at))
-        return self._kept[at]
+    def _record(self, at: int) -> Record:
+        return parse_record(self.path, self._data(at))
 
     def peek(self, at: int) -> dict[str, Any]:
         """The fields of a record, without keeping it."""
-        return self._kept[at].fields if at in self._kept else parse_fields(self.path, self._data(at))
+        return parse_fields(self.path, self._data(at))
 
     def _data(self, at: int) -> bytes:
         assert self._file is not None
