@@ -44,6 +44,15 @@ def test_without_dask_or_a_scheduler_it_is_a_line(
     assert not (tmp_path / "out").exists()
 
 
+def test_while_no_scheduler_answers_a_line_says_what_is_waited_for(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("animat.execution.cluster._CONNECT_S", 0.3)
+    with pytest.raises(AnimatError, match="no scheduler answers"):
+        Cluster("tcp://127.0.0.1:9")
+    assert capsys.readouterr().err.count("cluster: waiting up to 0.3 s for the scheduler at tcp://127.0.0.1:9\n") == 1
+
+
 def test_a_worker_takes_cores_in_a_folder_of_its_own_user_and_follows_no_link(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -157,7 +157,7 @@ def _expect_listener(address: str) -> None:
     host, _, port = place.rpartition(":")
     if has_kind and kind != "tcp":
         return
-    until_s = time.monotonic() + _CONNECT_S
+    until_s, is_said = time.monotonic() + _CONNECT_S, False
     while True:
         try:
             socket.create_connection((host.strip("[]"), int(port)), timeout=_CONNECT_S).close()
@@ -165,6 +165,9 @@ def _expect_listener(address: str) -> None:
         except OSError:
             if time.monotonic() > until_s:
                 raise
+        if not is_said:
+            print(f"cluster: waiting up to {_CONNECT_S} s for the scheduler at {address}", file=sys.stderr)
+            is_said = True
         time.sleep(0.2)
 
 
