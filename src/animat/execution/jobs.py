@@ -106,8 +106,8 @@ class Jobs:
             n_jobs = len(self._done) + len(running) + len(self.waiting) + len(failed)
             if failed:
                 parts.append(f"{len(failed)} failed")
-            note = f"{len(self._done)} of {counted(n_jobs, 'job')}; {'; '.join(parts)}" if parts else ""
-            progress.update(total_s - left_s, total_s, note)
+            note = "; ".join((f"{len(self._done)} of {counted(n_jobs, 'job')}", *parts))
+            progress.update(total_s - left_s, total_s, note if running or failed else "")
 
         def keep(future: Future[TaskResult]) -> None:
             job, result = running[future], future.result()
