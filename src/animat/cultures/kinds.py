@@ -8,16 +8,10 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from animat.cultures.base import Culture
-from animat.cultures.devices.cl1 import CL1_PULSE, CL1Culture
-from animat.cultures.devices.maxone import MaxOneCulture
-from animat.cultures.replay import ReplayCulture
-from animat.cultures.series import STATE_FILE
-from animat.cultures.virtual import VirtualCulture
 from animat.errors import InvalidArgument, expect_at_least
 from animat.progress import Progress
 from animat.recordings.recording import Recording
 from animat.stimulation.pulse import BALANCED_PULSE, PUBLISHED_PULSE, Pulse
-from animat.stimulation.selection import Selection
 
 CultureKind = Literal["virtual", "replay", "cl1", "maxone"]
 
@@ -45,15 +39,24 @@ def culture_of(
         if value is not None and kind != taken_by:
             raise InvalidArgument(f"{name}: expected none for a culture of kind {kind!r}, got {value}")
     if kind == "virtual":
+        from animat.cultures.virtual import VirtualCulture
+
         culture = VirtualCulture(seed, progress=progress)
         if state is not None:
             culture.restore_state(state)
         return culture
     if kind == "replay":
+        from animat.cultures.replay import ReplayCulture
+
         return ReplayCulture(recordings, seed=seed)
     if kind == "cl1":
+        from animat.cultures.devices.cl1 import CL1Culture
+
         return CL1Culture(seed=seed)
     if kind == "maxone":
+        from animat.cultures.devices.maxone import MaxOneCulture
+        from animat.stimulation.selection import Selection
+
         if selection is None:
             raise InvalidArgument("selection: expected a file of electrodes for a culture of kind 'maxone', got none")
         return MaxOneCulture(Selection.load(selection))
@@ -68,6 +71,8 @@ def pulse_for(kind: str, recorded: Pulse | None = None) -> Pulse:
     if recorded is not None and (kind != "replay" or recorded.kind == PUBLISHED_PULSE.kind):
         return recorded
     if kind == "cl1":
+        from animat.cultures.devices.cl1 import CL1_PULSE
+
         return CL1_PULSE
     # The published pulse as printed is not balanced: a living culture gets one that is.
     return BALANCED_PULSE if kind == "maxone" else PUBLISHED_PULSE
@@ -83,6 +88,8 @@ def recorded_culture(kind: CultureKind, recordings: Sequence[Recording], files: 
         return {}
     arguments: dict[str, Any] = {"seed": culture.seed}
     if kind == "virtual":
+        from animat.cultures.series import STATE_FILE
+
         folders = {file if file.is_dir() else file.parent for file in files}
         states = [folder / STATE_FILE for folder in folders if (folder / STATE_FILE).is_file()]
         if len(states) == 1:
