@@ -137,8 +137,8 @@ class Driver:
             elif agent.delivery == "yoked":
                 delivered = source[iteration % len(source)]
             for repeats in itertools.count():
-                tick, again = self._present(agent, episode, iteration, chosen, delivered, repeats)
-                if not again:
+                tick = self._present(agent, episode, iteration, chosen, delivered, repeats)
+                if tick.handled != "repeated":
                     break
             conditions.append(delivered)
             if tick.terminated or tick.truncated:
@@ -172,13 +172,8 @@ class Driver:
             raise Stop(Ending("controller", f"{agent.name} chose {chosen}: expected a condition from 0 to {n - 1}"))
         return chosen
 
-    def _present(
-        self, agent: Agent, episode: int, iteration: int, chosen: int, delivered: int, repeats: int
-    ) -> tuple[Tick, bool]:
-        """Present a condition and move the robot by the response, or return True to present it again instead.
-
-        In the warm-up (iteration -1) the robot stands still.
-        """
+    def _present(self, agent: Agent, episode: int, iteration: int, chosen: int, delivered: int, repeats: int) -> Tick:
+        """Present a condition and move the robot by the response, unless it is repeated or in the warm-up (-1)."""
         loop, is_warm_up = self.loop, iteration < 0
         frequency_hz = self._dealer.frequency_hz(delivered)
         due_s = self._last_pulse_s + 1 / frequency_hz
@@ -234,7 +229,7 @@ class Driver:
         try:
             if late_s and loop.on_late == "stop":
                 raise Stop(Ending("lateness", f"a pulse came {1000 * late_s:.3g} ms late, and on_late is stop"))
-            if not (again or is_warm_up):
+            if tick.handled == "unfinished":
                 tick = replace(tick, **self._move(agent, x_hz, is_burst, iteration))
             if self._adaptive is not None and stimuli and (agent.calibrates or is_warm_up) and not is_burst:
                 self._adaptive.add(delivered, came, np.asarray(x_hz))
@@ -244,7 +239,7 @@ class Driver:
             # Whatever happens to the robot, the culture's response is logged.
             self.records.append(record._replace(fields={**record.fields, "tick": vars(tick), **adapted}))
             self.unfinished = None
-        return tick, again
+        return tick
 
     def _move(
         self, agent: Agent, x_hz: Float64[np.ndarray, "*readouts"], is_burst: bool, iteration: int
