@@ -432,6 +432,9 @@ TRAINED: dict[str, Any] = {
 }
 
 
+SWAPS = [{"chunk": 0, "recorded_at_min": 100.0}, {"chunk": 7, "recorded_at_min": 107.5}]
+
+
 @pytest.mark.parametrize(
     ("changed", "until_min"),
     [
@@ -445,6 +448,12 @@ def test_training_ends_with_the_simulator_of_its_last_part(changed: dict[str, An
     provenance = {"training": TRAINED["training"] | changed}
     assert replace(two_forces(), provenance=provenance).trained_until_min(100.0) == until_min
     assert replace(two_forces(), provenance={}).trained_until_min(100.0) is None
+
+
+@pytest.mark.parametrize(("first_min", "until_min"), [(0.0, 107.5), (120.0, 120.0)])
+def test_live_training_ends_with_the_simulator_that_it_last_took(first_min: float, until_min: float) -> None:
+    """However long it was to take: it may have been interrupted."""
+    assert replace(two_forces(), provenance={**TRAINED, "swaps": SWAPS}).trained_until_min(first_min) == until_min
 
 
 def used(policy: Policy) -> None:
@@ -465,7 +474,7 @@ def used(policy: Policy) -> None:
 
 def change_everything(make: Callable[[], Policy], tmp_path: Path, every: int) -> int:
     """Give values of the metadata, one in so many, another type; returns how many files were refused."""
-    arrays, whole = taken_apart(replace(make(), provenance=TRAINED), tmp_path)
+    arrays, whole = taken_apart(replace(make(), provenance={**TRAINED, "swaps": SWAPS}), tmp_path)
     path, refusals = tmp_path / "p0.safetensors", 0
     for place, strange in list(itertools.product(places(whole), ("left out", *STRANGE)))[::every]:
         changed = json.loads(json.dumps(whole))

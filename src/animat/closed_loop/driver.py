@@ -173,7 +173,7 @@ class Driver:
         return chosen
 
     def _present(self, agent: Agent, episode: int, iteration: int, chosen: int, delivered: int, repeats: int) -> Tick:
-        """Present a condition and move the robot by the response, unless it is repeated or in the warm-up (-1)."""
+        """Present a condition and move the robot by the response, unless it is repeated or warms the culture up."""
         loop, is_warm_up = self.loop, iteration < 0
         frequency_hz = self._dealer.frequency_hz(delivered)
         due_s = self._last_pulse_s + 1 / frequency_hz

@@ -109,8 +109,8 @@ def bracket_findings(
     if not abs(difference) > max(_SAME, 3 * error + grid_error):
         return ()
     too_coarse = (
-        f", which is achievable, differ: the grid is too coarse (or the {CLASSES} history classes of a memory "
-        "simulator are); use a higher resolution"
+        ", which is achievable, differ: the grid is too coarse, or with a memory simulator its "
+        f"{CLASSES} history classes are; use a higher resolution"
     )
     which = " differ: the optimal return lies between the two" if difference > 0 else too_coarse
     if difference > 0 and best is not None and monte_carlo < best[1] < value:

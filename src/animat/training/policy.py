@@ -191,6 +191,9 @@ class Policy:
         first_min = max([first_min, *self.recorded_at_min[:1]])
         if not trained:
             return None
+        if swaps := self.provenance.get("swaps"):
+            # Live training may have been interrupted, and takes newer recordings as they come.
+            return max(first_min, float(swaps[-1]["recorded_at_min"]))
         if not trained.get("shadowing") or trained.get("duration_min") is None:
             return first_min
         return first_min + float(trained["duration_min"] * (trained["chunks"] - 1) / trained["chunks"])

@@ -104,10 +104,17 @@ class SimulatorProvenance(TypedDict, total=False):
     recorded_at_min: list[Number]
 
 
+class SwapProvenance(TypedDict):
+    """A simulator that live training went on with, of the recording at that minute."""
+
+    recorded_at_min: Number
+
+
 class Provenance(TypedDict, total=False):
     """The entries of a policy's provenance that code reads; the others are for people, and kept unchanged."""
 
     training: TrainingProvenance | None
+    swaps: list[SwapProvenance] | None
     simulators: SimulatorProvenance | None
     culture: RecordedCulture | None
 
