@@ -178,6 +178,11 @@ def test_a_task_reports_its_progress_in_a_file(tmp_path: Path) -> None:
             AnimatError,
             r"job: its process ended with status 7 \(is there enough memory\? .*\); run again to continue",
         ),
+        (
+            Die(status=0),
+            AnimatError,
+            r"job: its process ended with status 0 \(code in it ended the process, .*\); run again to continue",
+        ),
         pytest.param(
             Killed(),
             AnimatError,

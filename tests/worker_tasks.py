@@ -81,11 +81,14 @@ class Join(Sized):
                 file.write(f"{self.name} {what}\n")
 
 
+@dataclass(frozen=True)
 class Die(Sized):
     """Ends its process."""
 
+    status: int = 7
+
     def run(self, folder: Path, progress: Progress) -> list[Path]:
-        os._exit(7)
+        os._exit(self.status)
 
 
 class Killed(Sized):

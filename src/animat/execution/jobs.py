@@ -231,8 +231,11 @@ def _expect_success(future: Future[TaskResult], job: Job) -> None:
         # Raised by the executor: a process ended, or a machine was lost.
         message = " ".join(str(error).split()) or type(error).__name__
         # SIGTERM comes from a person or a program; the kernel uses SIGKILL when memory runs out.
-        is_terminated = message.endswith(f"status {-signal.SIGTERM}")
-        why = "another program ended it" if is_terminated else f"is there enough memory? {memory_of(job.task)}"
+        why = f"is there enough memory? {memory_of(job.task)}"
+        if message.endswith(f"status {-signal.SIGTERM}"):
+            why = "another program ended it"
+        if message.endswith("status 0"):
+            why = "code in it ended the process, such as that of a robot of your own"
         if isinstance(error, OSError) and error.errno == errno.EMFILE:
             why = "fewer --workers need fewer, and `ulimit -n` raises the limit"
         raise AnimatError(f"{job.name}: {message} ({why}); run again to continue") from error

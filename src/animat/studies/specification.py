@@ -315,9 +315,19 @@ class Study:
                         f"{compared.name!r}"
                     )
         if self.culture.kind != "files" and self.needs_neurons:
+            self._expect_a_choice()
             for compared in self.comparisons:
                 self._minute_of(compared, [i * self.culture.interval_min for i in range(self.culture.sessions)])
         read_record(SAC, self.algorithm, "algorithm")
+
+    def _expect_a_choice(self) -> None:
+        settings, frequencies_hz = self.simulators, self.culture.frequencies_hz or ()
+        is_by_frequency = settings.conditions in ("", "frequency") and self.culture.places is None
+        if is_by_frequency and len(frequencies_hz) == 1 and "one-condition" not in settings.allow:
+            raise InvalidArgument(
+                f"culture.frequencies_hz: expected two or more for an agent to choose from, got {frequencies_hz[0]:g}; "
+                'or other simulators.conditions (to allow it: simulators.allow = ["one-condition"])'
+            )
 
     def arm(self, name: str) -> Arm:
         """The arm of this name."""
