@@ -341,3 +341,12 @@ def test_a_training_is_found_whatever_its_folder_is_called(tmp_path: Path) -> No
         (tmp_path / name / "training.json").write_text("{}")
     # In a training there are no others.
     assert {item.place for item in find(tmp_path)} == {"checkpoints", "jobs"}
+
+
+def test_the_trainings_of_studies_are_found_in_the_folder_above(tmp_path: Path) -> None:
+    (tmp_path / "studies" / "culture-1" / "policies" / "cartpole" / "linear").mkdir(parents=True)
+    places = {"studies": "cultures.json", "studies/culture-1": "study.json"}
+    places["studies/culture-1/policies/cartpole/linear"] = "training.json"
+    for place, name in places.items():
+        (tmp_path / place / name).write_text("{}")
+    assert {item.place for item in find(tmp_path)} == set(places)

@@ -19,7 +19,7 @@ from animat.writing import LOCK
 
 _MARKS = {kind: names[0] for kind, names in MARKERS.items() if kind not in ("recording", "live")}
 """The file that identifies each kind."""
-_DEPTH, _MOST_FOLDERS, _MOST_ITEMS, _MOST_RECORDINGS = 4, 4000, 2000, 500
+_DEPTH, _MOST_FOLDERS, _MOST_ITEMS, _MOST_RECORDINGS = 6, 4000, 2000, 500
 _SKIPPED = ("jobs", "figures", "tables", "checkpoints")
 """Folders in an item's own, in which there is nothing to watch."""
 _LOCKS = Path("/proc/locks")
