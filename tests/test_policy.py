@@ -432,6 +432,20 @@ TRAINED: dict[str, Any] = {
 }
 
 
+def test_what_was_checked_stays_as_it_is(tmp_path: Path) -> None:
+    given = two_forces()
+    weight = given.weights[2].copy()
+    policy = replace(given, weights=(*given.weights[:2], weight))
+    weight[:] = np.nan
+    assert np.isfinite(policy.weights[2]).all()
+    for array in (*policy.weights, *policy.biases, policy.scales, policy.learning_curve, policy.assessments):
+        with pytest.raises(ValueError, match="read-only"):
+            array[...] = 0.0
+    policy.save(tmp_path / "p0.safetensors")
+    with pytest.raises(ValueError, match="read-only"):
+        Policy.load(tmp_path / "p0.safetensors").weights[0][0] = 1.0
+
+
 SWAPS = [{"chunk": 0, "recorded_at_min": 100.0}, {"chunk": 7, "recorded_at_min": 107.5}]
 
 

@@ -118,6 +118,11 @@ class Policy:
         if self.assessments.ndim != 2 or self.assessments.shape[1] != 5 or self.assessments.dtype.kind != "f":
             raise InvalidArgument(f"assessments: expected rows of five, got shape {self.assessments.shape}")
         expect_provenance(self.provenance)
+        # As in recordings: a policy that was checked stays what it is.
+        for name in ("weights", "biases"):
+            vars(self)[name] = tuple(map(_read_only, getattr(self, name)))
+        for name in ("scales", "learning_curve", "assessments"):
+            vars(self)[name] = _read_only(getattr(self, name))
         if self.mapping is not None:
             expect_fit(self.robot.name, self.robot.n_commands, len(self.readouts))
 
@@ -386,3 +391,9 @@ def load_policies(path: str | os.PathLike[str]) -> dict[str, Policy]:
     if not files:
         raise InvalidFile(f"{path}: expected policies (*.safetensors) in the folder, got none; train them first")
     return {file.stem: Policy.load(file) for file in files}
+
+
+def _read_only(array: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    own = np.array(array)
+    own.setflags(write=False)
+    return own
