@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import reduce
 from typing import Annotated, Any, ClassVar, Literal, get_args
 
@@ -155,17 +155,11 @@ class Ball:
         return (self.radius - jnp.sqrt(sum(squares[1:], squares[0]))) / scale
 
 
+Margins = Sequence[tuple["Float[Array, '']", "Bool[Array, '']"]]
+"""For each objective, the margin in [-1, 1] and whether the robot is in its region."""
+
 Region = Annotated[tuple[Range | Ball, ...], Field(min_length=1)]
 """The intersection of its parts: ranges of several quantities form a box."""
-
-
-def margin_of(
-    region: tuple[Range | Ball, ...], values: Mapping[str, Array], spec: Mapping[str, Quantity]
-) -> tuple[Float[Array, ""], Bool[Array, ""]]:
-    """How far inside a region a robot is (the smallest margin of its parts, in [-1, 1]), and whether it is inside."""
-    margins = [part.margin(values, spec) for part in region]
-    inside = [m >= 0 if part.includes_edge else m > 0 for part, m in zip(region, margins, strict=True)]
-    return jnp.clip(reduce(jnp.minimum, margins), -1.0, 1.0), reduce(jnp.logical_and, inside)
 
 
 def region_in_units(region: tuple[Range | Ball, ...], spec: Mapping[str, Quantity]) -> tuple[Range | Ball, ...]:
@@ -245,6 +239,18 @@ class Objective:
     def can_fail(self) -> bool:
         """Whether it may end an episode as failed."""
         return self.kind == "avoid" or self.within is not None
+
+
+def margins_of(objectives: Sequence[Objective], spec: Mapping[str, Quantity], observation: Array) -> Margins:
+    """How far inside the region of each objective a robot is, the least of its parts, and whether it is inside."""
+    values = dict(zip(spec, observation, strict=True))
+    margins = []
+    for objective in objectives:
+        of_parts = [(part.margin(values, spec), part.includes_edge) for part in objective.region]
+        least = jnp.clip(reduce(jnp.minimum, [margin for margin, _ in of_parts]), -1.0, 1.0)
+        inside = [margin >= 0 if includes_edge else margin > 0 for margin, includes_edge in of_parts]
+        margins.append((least, reduce(jnp.logical_and, inside)))
+    return margins
 
 
 @record

@@ -10,8 +10,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from animat.errors import InvalidArgument
-from animat.goals.goal import Objective, margin_of
-from animat.goals.tally import Margins
+from animat.goals.goal import Margins, Objective, margins_of
 from animat.lazy import Array, jax, jnp
 from animat.robots.base import Quantity, Robot, capability
 from animat.robots.grid import Axis, Grid
@@ -61,11 +60,6 @@ def _gone_beyond(robot: Robot[Any], axis: Axis) -> str:
     return f"goal: expected {expected}, got one with which they go on, {where}"
 
 
-def _margins(objectives: Sequence[Objective], spec: Mapping[str, Quantity], observation: Array) -> Margins:
-    values = dict(zip(spec, observation, strict=True))
-    return [margin_of(objective.region, values, spec) for objective in objectives]
-
-
 def _sampled(grid: Grid, n: int) -> tuple[Array, Array]:
     """Random nodes: their rows, and their places along these."""
     row, node = jax.random.randint(jax.random.key(0), (2, n), 0, jnp.array([[grid.n_rows], [grid.along.stored]]))
@@ -95,8 +89,8 @@ def _left(
         uniforms = jnp.full(robot.noise_size, 0.5)
         after, _, _ = robot.advance(uniforms, grid.state_at(row, node), u)
         later, _, task_ends = robot.advance(uniforms, after, u)
-        margins = _margins(objectives, spec, robot.observe(after))
-        goes_on = task_ends & ~goal_ends(margins) & ~goal_ends(_margins(objectives, spec, robot.observe(later)))
+        margins = margins_of(objectives, spec, robot.observe(after))
+        goes_on = task_ends & ~goal_ends(margins) & ~goal_ends(margins_of(objectives, spec, robot.observe(later)))
         coordinates, found = grid.to_coordinates(after), []
         for number, axis in enumerate(axes):
             width, value = axis.high - axis.low, coordinates[number]
@@ -119,7 +113,7 @@ def _is_decided(robot: Robot[Any], grid: Grid, objectives: Sequence[Objective], 
 
     def margins_after(row: Array, node: Array, chance: float, u: float) -> Array:
         after, _, _ = robot.advance(jnp.full(robot.noise_size, chance), grid.state_at(row, node), jnp.float32(u))
-        pairs = zip(objectives, _margins(objectives, spec, robot.observe(after)), strict=True)
+        pairs = zip(objectives, margins_of(objectives, spec, robot.observe(after)), strict=True)
         margins = [margin for objective, (margin, _) in pairs if objective.can_fail or objective.kind == "reach"]
         return jnp.stack(margins) if margins else jnp.zeros(0)
 

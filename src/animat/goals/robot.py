@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache, reduce
+from functools import cached_property, lru_cache, partial, reduce
 from typing import Any, NamedTuple, final
 
 import numpy as np
@@ -13,9 +13,9 @@ from jaxtyping import Bool, Float, Int
 
 from animat.arguments import checked_arguments
 from animat.errors import InvalidArgument, shown, within
-from animat.goals.goal import Goal, Objective, is_text, margin_of, read_goal, region_in_units
+from animat.goals.goal import Goal, Margins, Objective, is_text, margins_of, read_goal, region_in_units
 from animat.goals.grid import grid_with_goal
-from animat.goals.tally import Margins, Outcome, Tally, add_iteration, empty_tally, outcome
+from animat.goals.tally import Outcome, Tally, add_iteration, empty_tally, outcome
 from animat.lazy import Array, jax, jnp
 from animat.robots.base import WITHOUT, Quantity, Robot, Transition, Uniforms
 from animat.robots.grid import Grid
@@ -85,7 +85,7 @@ class RobotWithGoal(Robot[GoalState]):
     def __getattr__(self, name: str) -> Any:
         # It has those optional methods that its robot has.
         if name in (*WITHOUT, "with_goal_of") and hasattr(self.robot, name):
-            own = {"value_grid": self._value_grid, "with_goal_of": self._with_goal_of}
+            own = {"value_grid": partial(_grid_of, self), "with_goal_of": self._with_goal_of}
             return own.get(name) or getattr(self.robot, name)
         raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 
@@ -204,8 +204,7 @@ class RobotWithGoal(Robot[GoalState]):
         return result
 
     def _margins(self, observation: Float[Array, " observations"]) -> Margins:
-        values = dict(zip(self._spec, observation, strict=True))
-        return [margin_of(objective.region, values, self._spec) for objective in self._objectives]
+        return margins_of(self._objectives, self._spec, observation)
 
     def _outside(self, margins: Margins, before: Sequence[Int[Array, ""]] | None = None) -> tuple[Int[Array, ""], ...]:
         timed = [inside for of, (_, inside) in zip(self._objectives, margins, strict=True) if of.within is not None]
@@ -219,9 +218,6 @@ class RobotWithGoal(Robot[GoalState]):
     def _largest(self, flags: Sequence[Bool[Array, ""]]) -> Float[Array, ""]:
         """The largest share of the flagged objectives."""
         return reduce(jnp.maximum, (flag * share for flag, share in zip(flags, self._shares, strict=True)))
-
-    def _value_grid(self) -> Grid:
-        return _grid_of(self)
 
 
 @lru_cache(maxsize=8)

@@ -9,11 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from animat.goals.goal import Objective
+from animat.goals.goal import Margins, Objective
 from animat.lazy import Array, jax, jnp
-
-Margins = Sequence[tuple["Float[Array, '']", "Bool[Array, '']"]]
-"""For each objective, the margin in [-1, 1] and whether the robot is in its region."""
 
 
 class Tally(NamedTuple):
