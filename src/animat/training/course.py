@@ -96,10 +96,10 @@ def programs_with_ranges(
         return Varied(environment, varying, ranges)
 
     def chunk(ranges: Ranges, *arguments: Any) -> Any:
-        return train_chunk(EpisodeLimit(varied(ranges)), algorithm, *arguments)
+        return train_chunk(varied(ranges), algorithm, *arguments)
 
     return (
-        jit_side_by_side(lambda ranges, key: begin(EpisodeLimit(varied(ranges)), algorithm, key)),
+        jit_side_by_side(lambda ranges, key: begin(varied(ranges), algorithm, key)),
         jit_side_by_side(chunk, (0, 0, None, None, None), donate_argnums=1),
         jit_side_by_side(lambda ranges, *arguments: assess(varied(ranges), episodes, *arguments), (0, 0, None, None)),
     )

@@ -29,7 +29,6 @@ from animat.training.policy import CURVE, Policy
 from animat.training.sac import Diagnosis, begin, diagnosis_program, train_chunk
 from animat.training.settings import SAC
 from animat.training.specification import CHUNKS, Training
-from animat.wrappers import EpisodeLimit
 from animat.writing import atomic_write
 
 BEST = "best"
@@ -138,11 +137,10 @@ def programs(
     environment: Environment[Any], algorithm: SAC, own_simulators: bool = False
 ) -> tuple[Callable[..., Any], Callable[..., Any]]:
     """`begin` and `train_chunk` for several policies, traced once per process; each may have its own simulator."""
-    limited = EpisodeLimit(environment)
     in_axes = (0, 0 if own_simulators else None, None, None)
     return (
-        jit_side_by_side(partial(begin, limited, algorithm)),
-        jit_side_by_side(partial(train_chunk, limited, algorithm), in_axes, donate_argnums=0),
+        jit_side_by_side(partial(begin, environment, algorithm)),
+        jit_side_by_side(partial(train_chunk, environment, algorithm), in_axes, donate_argnums=0),
     )
 
 

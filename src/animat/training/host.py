@@ -5,7 +5,6 @@ A round is divided where the bodies move: one compiled program takes what they d
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
@@ -20,9 +19,9 @@ from animat.environment import Environment, Neurons
 from animat.neurons.history import INITIAL_HISTORY
 from animat.robots.host import Bodies, HostRobot, Snapshot
 from animat.training.replay import pack_transitions
-from animat.training.sac import Finished, Learner, begin, choose_actions, critic_state, end_round, learn, uniform_shapes
+from animat.training.sac import Finished, Learner, begin, choose_actions, critic_state, draw_uniforms, end_round, learn
 from animat.training.settings import SAC
-from animat.wrappers import EpisodeLimit, TrialCosts, add_cost
+from animat.wrappers import TrialCosts, add_cost
 
 
 class Actions(NamedTuple):
@@ -37,8 +36,8 @@ class Actions(NamedTuple):
 def act(environment: Environment[Any], settings: SAC, learner: Learner, simulator: Neurons) -> tuple[Learner, Actions]:
     """The actions of a round; arguments as in `animat.training.sac.train_chunk`."""
     key, use = jax.random.split(learner.key)
-    acting, _ = uniform_shapes(environment, settings)
-    return _act(environment, learner._replace(key=key), simulator, jax.random.uniform(use, acting))
+    for_acting, _ = draw_uniforms(environment, settings, use)
+    return _act(environment, learner._replace(key=key), simulator, for_acting)
 
 
 def learn_and_act(
@@ -54,11 +53,8 @@ def learn_and_act(
 
     `moved` is what the bodies did: their `StepResult`, and what is observed once ended episodes have restarted.
     """
-    acting, learning = uniform_shapes(environment, settings)
-    n_acting = math.prod(acting)
     key, use = jax.random.split(learner.key)
-    uniforms = jax.random.uniform(use, (n_acting + math.prod(learning),))
-
+    for_acting, for_learning = draw_uniforms(environment, settings, use)
     before, ((observation, reward, terminated, truncated), begun) = learner.episodes, moved
     ended = terminated | truncated
     after = before._replace(robot=observation, iteration=before.iteration + 1, neurons=acted.neurons, reward=reward)
@@ -76,8 +72,8 @@ def learn_and_act(
         info=jax.tree.map(lambda cost: jnp.where(ended, 0.0, cost), after.info),
     )
     learner, finished = end_round(settings, learner._replace(key=key), index, rows, after, ended, episodes)
-    learner = learn(environment, settings, learner, index, uniforms[n_acting:].reshape(learning))
-    return *_act(environment, learner, simulator, uniforms[:n_acting].reshape(acting)), finished
+    learner = learn(environment, settings, learner, index, for_learning)
+    return *_act(environment, learner, simulator, for_acting), finished
 
 
 def _act(
@@ -98,7 +94,7 @@ def _act(
 def _compiled(environment: Environment[Any], algorithm: SAC) -> tuple[Callable[..., Any], ...]:
     """`begin`, `act` and `learn_and_act` for several policies."""
     return (
-        jit_side_by_side(partial(begin, EpisodeLimit(environment), algorithm)),
+        jit_side_by_side(partial(begin, environment, algorithm)),
         jit_side_by_side(partial(act, environment, algorithm), (0, None), donate_argnums=0),
         jit_side_by_side(partial(learn_and_act, environment, algorithm), (0, 0, 0, None, None), donate_argnums=(0, 1)),
     )

@@ -140,7 +140,7 @@ def continuous_losses(
     return critic_loss, actor_loss, alpha_loss
 
 
-def begin(environment: EpisodeLimit[Any], settings: SAC, key: PRNGKeyArray) -> Learner:
+def begin(environment: Environment[Any], settings: SAC, key: PRNGKeyArray) -> Learner:
     """A new, untrained policy; every random draw of its training follows from `key`."""
     weight_key, reset_key, key = jax.random.split(key, 3)
     n, n_actions, hidden = len(environment.observation_spec), environment.n_actions, settings.hidden
@@ -164,32 +164,29 @@ def begin(environment: EpisodeLimit[Any], settings: SAC, key: PRNGKeyArray) -> L
 
 
 def train_chunk(
-    environment: EpisodeLimit[Any], settings: SAC, learner: Learner, simulator: Neurons, first: Index, last: Index
+    environment: Environment[Any], settings: SAC, learner: Learner, simulator: Neurons, first: Index, last: Index
 ) -> tuple[Learner, Finished]:
     """Act and learn for some rounds with one simulator; in a round every environment does one iteration.
 
-    Environment and settings are static. The last round is excluded; policies trained side by side have the same rounds.
+    Environment and settings are static, and episodes are cut off at the robot's limit. The last round is excluded;
+    policies trained side by side have the same rounds.
     """
-    acting, learning = uniform_shapes(environment, settings)
-    n_acting = math.prod(acting)
 
     def one_round(index: Index, carry: tuple[Learner, Finished]) -> tuple[Learner, Finished]:
         learner, finished = carry
         key, use, reset_key = jax.random.split(learner.key, 3)
-        uniforms = jax.random.uniform(use, (n_acting + math.prod(learning),))
+        for_acting, for_learning = draw_uniforms(environment, settings, use)
         before = learner.episodes
         state = critic_state(environment, before)
-        learner, action, noise = choose_actions(
-            environment, learner._replace(key=key), state[:, :-1], uniforms[:n_acting].reshape(acting)
-        )
-        after = jax.vmap(environment.advance, (0, 0, 0, None))(noise, before, action, simulator)
+        learner, action, noise = choose_actions(environment, learner._replace(key=key), state[:, :-1], for_acting)
+        after = jax.vmap(EpisodeLimit(environment).advance, (0, 0, 0, None))(noise, before, action, simulator)
         ended = jnp.logical_or(*after.ended)
         reward = shaped(environment.robot, settings, before.robot, after.robot, net_reward(before, after), ended)
         rows = pack_transitions(settings, state, critic_state(environment, after), action, reward, ended)
         started = jax.vmap(environment.reset)(jax.random.split(reset_key, settings.environments))
         episodes = jax.tree.map(lambda new, old: jax.vmap(jnp.where)(ended, new, old), started.carried, after.carried)
         learner, of_round = end_round(settings, learner, index, rows, after, ended, episodes)
-        learner = learn(environment, settings, learner, index, uniforms[n_acting:].reshape(learning))
+        learner = learn(environment, settings, learner, index, for_learning)
         return learner, jax.tree.map(jnp.add, finished, of_round)
 
     nothing = Finished(jnp.float32(0.0), jnp.float32(0.0))
@@ -197,11 +194,16 @@ def train_chunk(
     return trained
 
 
-def uniform_shapes(environment: Environment[Any], settings: SAC) -> tuple[tuple[int, int], tuple[int, int, int]]:
-    """The shapes of a round's uniforms for acting and for learning, which are drawn as one block."""
+def draw_uniforms(
+    environment: Environment[Any], settings: SAC, key: PRNGKeyArray
+) -> tuple[Float[Array, "environments uniforms"], Float[Array, "gradient_steps blocks batch"]]:
+    """The uniforms of a round for acting and for learning, drawn as one block."""
+    acting = settings.environments, environment.n_drawn + n_uniforms(environment) + environment.noise_size
     blocks = 1 if environment.n_actions is not None else 1 + 2 * environment.n_drawn
-    acting = (settings.environments, environment.n_drawn + n_uniforms(environment) + environment.noise_size)
-    return acting, (settings.gradient_steps, blocks, settings.batch)
+    learning = settings.gradient_steps, blocks, settings.batch
+    uniforms = jax.random.uniform(key, (math.prod(acting) + math.prod(learning),))
+    for_acting, for_learning = jnp.split(uniforms, [math.prod(acting)])
+    return for_acting.reshape(acting), for_learning.reshape(learning)
 
 
 def shaped(

@@ -32,7 +32,6 @@ from animat.training.settings import SAC
 from animat.training.specification import CHUNKS, Training
 from animat.tuning.search import Trial
 from animat.tuning.specification import NUMBERS, with_settings
-from animat.wrappers import EpisodeLimit
 from animat.writing import write_whole
 
 Numbers = dict[str, Array]
@@ -62,17 +61,16 @@ def programs(environment: Environment[Any], algorithm: SAC) -> tuple[Callable[..
 
     The programs of ordinary training (`animat.training.group.programs`) have these settings compiled in.
     """
-    limited = EpisodeLimit(environment)
 
     def beginning(numbers: Numbers, key: Array) -> Learner:
-        learner = begin(limited, algorithm, key)
+        learner = begin(environment, algorithm, key)
         return learner._replace(trained=learner.trained._replace(log_alpha=jnp.log(numbers["initial_alpha"])))
 
     def chunk(numbers: Numbers, learner: Learner, simulator: NeuronSimulator | None, first: Array, last: Array) -> Any:
         # Traced numbers bypass the record's checks.
         settings = object.__new__(SAC)
         vars(settings).update({**vars(algorithm), **numbers})
-        return train_chunk(limited, settings, learner, simulator, first, last)
+        return train_chunk(environment, settings, learner, simulator, first, last)
 
     return jit_side_by_side(beginning), jit_side_by_side(chunk, (0, 0, None, None, None), donate_argnums=1)
 
