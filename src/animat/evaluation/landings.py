@@ -77,7 +77,7 @@ class Motion:
         def from_rows(rows: Int32[Array, " rows"]) -> tuple[Array, ...]:
             along = jnp.arange(grid.along.stored)
             states = jax.vmap(jax.vmap(grid.state_at, (None, 0)), (0, None))(rows, along)
-            flat = jax.tree.map(lambda x: jnp.broadcast_to(x, (len(rows), len(along))).ravel(), states)
+            flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), states)
             landed = (x.reshape(len(self._u), len(rows), len(along), *x.shape[2:]) for x in from_states(flat))
             row, row_places, node, place, reward, positions = landed
             middle = len(along) // 2

@@ -16,6 +16,7 @@ from collections.abc import Mapping, Sequence
 from functools import reduce
 from typing import Annotated, Any, ClassVar, Literal, get_args
 
+import numpy as np
 from jaxtyping import Bool, Float
 from pydantic import Field
 
@@ -155,8 +156,8 @@ class Ball:
         return (self.radius - jnp.sqrt(sum(squares[1:], squares[0]))) / scale
 
 
-Margins = Sequence[tuple["Float[Array, '']", "Bool[Array, '']"]]
-"""For each objective, the margin in [-1, 1] and whether the robot is in its region."""
+Margins = tuple["Float[Array, ' objectives']", "Bool[Array, ' objectives']"]
+"""For each objective, the margin in [-1, 1], and whether the robot is in its region."""
 
 Region = Annotated[tuple[Range | Ball, ...], Field(min_length=1)]
 """The intersection of its parts: ranges of several quantities form a box."""
@@ -244,13 +245,17 @@ class Objective:
 def margins_of(objectives: Sequence[Objective], spec: Mapping[str, Quantity], observation: Array) -> Margins:
     """How far inside the region of each objective a robot is, the least of its parts, and whether it is inside."""
     values = dict(zip(spec, observation, strict=True))
-    margins = []
+    least, inside = [], []
     for objective in objectives:
-        of_parts = [(part.margin(values, spec), part.includes_edge) for part in objective.region]
-        least = jnp.clip(reduce(jnp.minimum, [margin for margin, _ in of_parts]), -1.0, 1.0)
-        inside = [margin >= 0 if includes_edge else margin > 0 for margin, includes_edge in of_parts]
-        margins.append((least, reduce(jnp.logical_and, inside)))
-    return margins
+        margins = [(part.margin(values, spec), part.includes_edge) for part in objective.region]
+        least.append(jnp.clip(reduce(jnp.minimum, [margin for margin, _ in margins]), -1.0, 1.0))
+        inside.append(reduce(jnp.logical_and, [margin >= 0 if edge else margin > 0 for margin, edge in margins]))
+    return jnp.stack(least), jnp.stack(inside)
+
+
+def of_kind(objectives: Sequence[Objective], *kinds: Kind) -> Bool[np.ndarray, " objectives"]:
+    """Which of the objectives are of one of these kinds."""
+    return np.array([objective.kind in kinds for objective in objectives])
 
 
 @record

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from animat.errors import InvalidArgument
-from animat.goals.goal import Margins, Objective, margins_of
+from animat.goals.goal import Objective, margins_of, of_kind
 from animat.lazy import Array, jax, jnp
 from animat.robots.base import Quantity, Robot, capability
 from animat.robots.grid import Axis, Grid
@@ -75,10 +75,10 @@ def _left(
     not end, such as those of velocities, are as good for the goal as they are for the task.
     """
     axes = (grid.along, *grid.rows)
-    ending = [objective.kind in ("avoid", "reach") for objective in objectives]
 
-    def goal_ends(margins: Margins) -> Array:
-        return jnp.any(jnp.stack([inside & ends for (_, inside), ends in zip(margins, ending, strict=True)]))
+    def goal_ends(state: Any) -> Array:
+        _, inside = margins_of(objectives, spec, robot.observe(state))
+        return jnp.any(inside & of_kind(objectives, "avoid", "reach"))
 
     def apart(state: Any) -> Array:
         """How far the state is from the edge of each part of each region: unlike margins, also far away."""
@@ -89,8 +89,7 @@ def _left(
         uniforms = jnp.full(robot.noise_size, 0.5)
         after, _, _ = robot.advance(uniforms, grid.state_at(row, node), u)
         later, _, task_ends = robot.advance(uniforms, after, u)
-        margins = margins_of(objectives, spec, robot.observe(after))
-        goes_on = task_ends & ~goal_ends(margins) & ~goal_ends(margins_of(objectives, spec, robot.observe(later)))
+        goes_on = task_ends & ~goal_ends(after) & ~goal_ends(later)
         coordinates, found = grid.to_coordinates(after), []
         for number, axis in enumerate(axes):
             width, value = axis.high - axis.low, coordinates[number]
@@ -110,12 +109,12 @@ def _left(
 
 def _is_decided(robot: Robot[Any], grid: Grid, objectives: Sequence[Objective], spec: Mapping[str, Quantity]) -> bool:
     """Whether the state decides if the next iteration ends the episode, for any command; tested on random nodes."""
+    decide = np.array([objective.can_fail or objective.kind == "reach" for objective in objectives])
 
     def margins_after(row: Array, node: Array, chance: float, u: float) -> Array:
         after, _, _ = robot.advance(jnp.full(robot.noise_size, chance), grid.state_at(row, node), jnp.float32(u))
-        pairs = zip(objectives, margins_of(objectives, spec, robot.observe(after)), strict=True)
-        margins = [margin for objective, (margin, _) in pairs if objective.can_fail or objective.kind == "reach"]
-        return jnp.stack(margins) if margins else jnp.zeros(0)
+        margins, _ = margins_of(objectives, spec, robot.observe(after))
+        return margins[decide]
 
     after = jax.vmap(margins_after, (0, 0, None, None))
     nodes = _sampled(grid, 256)

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 
 from animat.arguments import checked_arguments
 from animat.errors import InvalidArgument, shown, within
-from animat.goals.goal import Goal, Margins, Objective, is_text, margins_of, read_goal, region_in_units
+from animat.goals.goal import Goal, Margins, Objective, is_text, margins_of, of_kind, read_goal, region_in_units
 from animat.goals.grid import grid_with_goal
 from animat.goals.tally import Outcome, Tally, add_iteration, empty_tally, outcome
 from animat.lazy import Array, jax, jnp
@@ -134,8 +134,9 @@ class RobotWithGoal(Robot[GoalState]):
 
     def caveats(self) -> tuple[str, ...]:
         """Those of the robot, and a warning if episodes start in a region that ends them."""
-        pairs = zip(self.goal.objectives, self._margins(self.observe(self.reset(jax.random.key(0)))), strict=True)
-        ending = [objective for objective, (_, inside) in pairs if inside and objective.kind in ("avoid", "reach")]
+        _, inside = self._margins(self.observe(self.reset(jax.random.key(0))))
+        ends = np.flatnonzero(inside & of_kind(self.goal.objectives, "avoid", "reach"))
+        ending = [self.goal.objectives[i] for i in ends]
         return (*self.robot.caveats(), *(f"goal: episodes of {self.name} start in the region: {of}" for of in ending))
 
     def departures(self) -> tuple[tuple[str, str], ...]:
@@ -161,12 +162,12 @@ class RobotWithGoal(Robot[GoalState]):
         outside, no = self._outside(margins, outside), jnp.bool_(False)
         counts = iter(outside)
         failures, reaches, running = [], [], jnp.float32(0.0)
-        for objective, share, (margin, inside) in zip(self._objectives, self._shares, margins, strict=True):
+        for objective, share, margin, inside in zip(self._objectives, self._shares, *margins, strict=True):
             is_late = no if objective.within is None else next(counts) > objective.within
             failures.append(inside if objective.kind == "avoid" else is_late)
             reaches.append(inside if objective.kind == "reach" else no)
             worth: Any = {"avoid": 1.0, "reach": 0.0, "drive": inside}.get(objective.kind, (1.0 + margin) / 2)
-            running += share / len(margins) * worth
+            running += share / len(self._shares) * worth
         failed, reached = reduce(jnp.logical_or, failures), reduce(jnp.logical_or, reaches)
         reward = jnp.where(reached, REACHED * self._largest(reaches), running - self._cost)
         failure = FAILED * self._largest(failures) + self._cost * self.episode_limit
@@ -182,10 +183,10 @@ class RobotWithGoal(Robot[GoalState]):
         The other objectives pay on the way.
         """
         potential: Array = jnp.float32(0.0)
-        margins = self._margins(self.observe(state))
-        for objective, share, (margin, _) in zip(self._objectives, self._shares, margins, strict=True):
+        margins, _ = self._margins(self.observe(state))
+        for objective, share, margin in zip(self._objectives, self._shares, margins, strict=True):
             if objective.kind in ("reach", "drive"):
-                potential += POTENTIAL * share / len(margins) * jnp.minimum(margin, 0.0)
+                potential += POTENTIAL * share / len(self._shares) * jnp.minimum(margin, 0.0)
         return potential
 
     def succeeded(self, state: GoalState) -> Bool[Array, ""]:
@@ -207,7 +208,7 @@ class RobotWithGoal(Robot[GoalState]):
         return margins_of(self._objectives, self._spec, observation)
 
     def _outside(self, margins: Margins, before: Sequence[Int[Array, ""]] | None = None) -> tuple[Int[Array, ""], ...]:
-        timed = [inside for of, (_, inside) in zip(self._objectives, margins, strict=True) if of.within is not None]
+        timed = [inside for of, inside in zip(self._objectives, margins[1], strict=True) if of.within is not None]
         before = [jnp.int32(0)] * len(timed) if before is None else before
         return tuple(jnp.where(inside, 0, n + 1).astype(jnp.int32) for inside, n in zip(timed, before, strict=True))
 

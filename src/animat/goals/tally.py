@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import reduce
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from animat.goals.goal import Margins, Objective
+from animat.goals.goal import Margins, Objective, of_kind
 from animat.lazy import Array, jax, jnp
 
 
@@ -23,9 +22,9 @@ class Tally(NamedTuple):
     """
 
     iterations: Int[Array, ""]
-    inside: tuple[Int[Array, ""], ...]
-    is_inside: tuple[Bool[Array, ""], ...]
-    margins: tuple[Float[Array, ""], ...]
+    inside: Int[Array, " objectives"]
+    is_inside: Bool[Array, " objectives"]
+    margins: Float[Array, " objectives"]
     failed: Bool[Array, ""]
     reached: Bool[Array, ""]
 
@@ -77,29 +76,19 @@ def satisfaction_line(objectives: Sequence[str], means: Mapping[str, Any]) -> st
 
 def empty_tally(objectives: Sequence[Objective]) -> Tally:
     """The tally at the start of an episode."""
-    margins = tuple(jnp.float32(1.0 if objective.kind == "avoid" else -1.0) for objective in objectives)
-    none, no = jnp.int32(0), jnp.bool_(False)
-    return Tally(none, tuple(none for _ in objectives), tuple(no for _ in objectives), margins, no, no)
+    n, no = len(objectives), jnp.bool_(False)
+    margins = jnp.where(of_kind(objectives, "avoid"), jnp.float32(1.0), -1.0)
+    return Tally(jnp.int32(0), jnp.zeros(n, jnp.int32), jnp.zeros(n, bool), margins, no, no)
 
 
 def add_iteration(
     objectives: Sequence[Objective], tally: Tally, margins: Margins, failed: Bool[Array, ""], reached: Bool[Array, ""]
 ) -> Tally:
     """Add one iteration, unless the episode has ended before it."""
-
-    def margin(kind: str, before: Array, now: Array) -> Array:
-        if kind == "avoid":
-            return jnp.minimum(before, -now)
-        return jnp.maximum(before, now) if kind == "reach" else now
-
-    after = Tally(
-        tally.iterations + 1,
-        tuple(before + inside for before, (_, inside) in zip(tally.inside, margins, strict=True)),
-        tuple(inside for _, inside in margins),
-        tuple(margin(of.kind, *m) for of, *m in zip(objectives, tally.margins, (m for m, _ in margins), strict=True)),
-        failed,
-        reached,
-    )
+    margin, inside = margins
+    best = jnp.where(of_kind(objectives, "reach"), jnp.maximum(tally.margins, margin), margin)
+    kept = jnp.where(of_kind(objectives, "avoid"), jnp.minimum(tally.margins, -margin), best)
+    after = Tally(tally.iterations + 1, tally.inside + inside, inside, kept, failed, reached)
     ended = tally.failed | tally.reached
     updated: Tally = jax.tree.map(lambda old, new: jnp.where(ended, old, new), tally, after)
     return updated
@@ -107,24 +96,17 @@ def add_iteration(
 
 def outcome(objectives: Sequence[Objective], tally: Tally, episode_limit: int) -> Outcome:
     """The outcome of an episode by its tally at the end."""
+    avoids, reaches, margins = of_kind(objectives, "avoid"), of_kind(objectives, "reach"), tally.margins
+    avoided = jnp.where(tally.inside > 0, (tally.iterations - 1) / episode_limit, 1.0)
     out_of = jnp.maximum(jnp.where(tally.failed, episode_limit, tally.iterations), 1)
-
-    def satisfaction(kind: str, inside: Array, margin: Array) -> Array:
-        if kind == "avoid":
-            return jnp.where(inside > 0, (tally.iterations - 1) / episode_limit, 1.0)
-        return 1.0 + jnp.minimum(margin, 0.0) if kind == "reach" else inside / out_of
-
-    results = list(zip((objective.kind for objective in objectives), tally.margins, tally.is_inside, strict=True))
-    avoided = [margin for kind, margin, _ in results if kind == "avoid"]
-    reaches = [margin for kind, margin, _ in results if kind == "reach"]
-    others = [(margin, inside) for kind, margin, inside in results if kind not in ("avoid", "reach")]
-    # Reaching a region ends the episode, and suffices unless the episode has failed.
-    deciding = [reduce(jnp.maximum, reaches)] if reaches else [margin for margin, _ in others]
-    met = tally.reached if reaches else reduce(jnp.logical_and, [inside for _, inside in others], jnp.bool_(True))
-    rows = zip(objectives, tally.inside, tally.margins, strict=True)
-    return Outcome(
-        met & ~tally.failed,
-        100 * jnp.stack([jnp.float32(satisfaction(objective.kind, *row)) for objective, *row in rows]),
-        # The objective that failed need not be among those that decide when none fails.
-        jnp.where(tally.failed, reduce(jnp.minimum, tally.margins), reduce(jnp.minimum, [*avoided, *deciding])),
-    )
+    # One by one: where many are divided by one number, XLA multiplies by its reciprocal, which is rounded.
+    there = jnp.stack([inside / out_of for inside in tally.inside])
+    satisfaction = jnp.where(avoids, avoided, jnp.where(reaches, 1.0 + jnp.minimum(margins, 0.0), there))
+    worst = jnp.min(margins)
+    if reaches.any():
+        # Reaching a region ends the episode, and suffices unless the episode has failed.
+        met, margin = tally.reached, jnp.min(margins, where=avoids, initial=jnp.max(margins[reaches]))
+    else:
+        met, margin = jnp.all(tally.is_inside | avoids), worst
+    # The objective that failed need not be among those that decide when none fails.
+    return Outcome(met & ~tally.failed, 100 * satisfaction, jnp.where(tally.failed, worst, margin))
