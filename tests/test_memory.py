@@ -512,6 +512,7 @@ def test_a_study_keeps_simulators_of_every_kind(kind: Kind, tmp_path: Path) -> N
         (b"{}", "header"),
         (save({"a": np.zeros(3)}), "no entry 'animat'"),
         (save({"a": np.zeros(3)}, {"animat": '{"format": "a policy"}'}), "no entry 'conditions'"),
+        (save({"a": np.zeros(3)}, {"animat": "[" * 100_000}), "recursion"),
     ],
 )
 def test_a_file_of_another_kind_is_no_simulators(content: bytes | None, reason: str, tmp_path: Path) -> None:

@@ -253,7 +253,7 @@ def load_timeline(path: Path) -> SimulatorTimeline:
             # Older files do not state it.
             culture=read_record(RecordedCulture, stated, "culture") if (stated := metadata.get("culture")) else None,
         )
-    except (OSError, ValueError, KeyError, TypeError, SafetensorError, AnimatError) as error:
+    except (OSError, ValueError, KeyError, TypeError, RecursionError, SafetensorError, AnimatError) as error:
         reason = f"no entry {error}" if isinstance(error, KeyError) else error
         expected = "simulators as animat study and animat tune write them"
         got = f"another file ({reason}); run the command again to replace it"

@@ -21,6 +21,7 @@ from animat.folders import expect_no_other, first_difference, folder_mismatch, r
 from animat.goals.robot import without_goal
 from animat.neurons.timeline import SIMULATORS, SimulatorTimeline
 from animat.plain_file import expect_no_file
+from animat.records import read_record
 from animat.robots.base import Robot
 from animat.robots.checking import check_robot
 from animat.robots.host import HostRobot
@@ -29,7 +30,7 @@ from animat.robots.registry import REGISTRY as ROBOTS
 from animat.training.course import ASSESSED
 from animat.training.group import BEST, Group, split_groups
 from animat.training.policy import Policy
-from animat.training.settings import LEARNER
+from animat.training.settings import LEARNER, Policies
 from animat.training.specification import CHUNKS, Training
 from animat.training.varied import expect_varied, varying_in
 from animat.writing import clear_leftovers, write_whole
@@ -137,9 +138,9 @@ def expect_folder_for(training: Training, folder: Path) -> None:
 
 def missing_policies(folder: Path) -> tuple[int, int]:
     """How many policies a training's folder lacks, and of how many; 0 of 0 where no training is described."""
-    with suppress(OSError, InvalidFile, KeyError, TypeError):
+    with suppress(OSError, InvalidFile, InvalidArgument, KeyError, TypeError):
         if (stored := read_description(folder / MANIFEST, "training")) is not None:
-            planned: int = stored["training"]["policies"]
+            planned: int = read_record(Policies, stored["training"]["policies"])
             return sum(not (folder / f"p{i}.safetensors").exists() for i in range(planned)), planned
     return 0, 0
 
