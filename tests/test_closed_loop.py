@@ -616,6 +616,8 @@ def test_a_loop_presents_as_the_policy_was_recorded_and_names_where_it_does_not(
         ({"on_burst": "panic"}, "use, repeat, skip"),
         ({"on_late": "panic"}, "continue, stop"),
         ({"pause_s": -1.0}, "pause_s"),
+        ({"pause_s": "2"}, "pause_s: expected a number, got '2'"),
+        ({"most_repeats": 2.5}, "most_repeats: expected a whole number, got 2.5"),
         ({"warm_up": -1}, "warm_up"),
         ({"warm_up": 1.5}, "warm_up: expected a whole number"),
         ({"settling": -1}, "settling: expected a whole number from 0 to 100, got -1"),

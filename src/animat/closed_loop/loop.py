@@ -116,7 +116,9 @@ class Loop:
                 object.__setattr__(self, name, number)
             if not (isinstance(number, int) and 0 <= number <= MOST_WARM_UP):
                 raise InvalidArgument(f"{name}: expected a whole number from 0 to {MOST_WARM_UP}, got {number!r}")
-        for name in ("burst_threshold", "pause_s", "patience_s", "most_repeats"):
+        kinds = {"burst_threshold": float, "pause_s": float, "patience_s": float, "most_repeats": int}
+        for name, kind in kinds.items():
+            check_argument(name, getattr(self, name), kind)
             if not 0 <= getattr(self, name) < math.inf:
                 raise InvalidArgument(f"{name}: expected a finite number from 0, got {getattr(self, name):g}")
         if self.patience_s == 0:
