@@ -875,7 +875,15 @@ COMPARED = (
         ),
         ("[[robots]]\nname = 'cartpole'\nparameters = { name = 1 }", "expected parameters among"),
         ('[[arms]]\nname = "a"\nshadowing = "off"', "arms.shadowing: expected True, False or 'drawn', got 'off'"),
-        ("[culture]\nfrequencies_hz = [20]", "culture.frequencies_hz: expected two or more for an agent to choose"),
+        ("[culture]\nfrequencies_hz = [20]", "expected two or more for an agent to choose from, got one (20 Hz)"),
+        (
+            "[culture]\nplaces = 'corners'\n[simulators]\nconditions = 'frequency'",
+            "agent to choose from, got one (20 Hz)",
+        ),
+        (
+            "[simulators]\nconditions = 'all'",
+            "simulators.conditions: expected two or more for an agent to choose from, got one (all)",
+        ),
         ("[algorithm]\nhiden = 8", "hiden: no such setting in [algorithm]; expected some of environments"),
         ("[algorithm]\nhidden = 'x'", "algorithm.hidden: expected a number"),
         ("[algorithm]\nhidden = 64.0", "algorithm.hidden: expected a whole number, got 64.0"),

@@ -25,10 +25,10 @@ from animat.folders import first_difference
 from animat.neurons.timeline import SimulatorTimeline, fit_timeline
 from animat.progress import Progress, Silent
 from animat.robots import Cartpole, Navigation
-from animat.training.folder import describe
+from animat.training.folder import describe, missing_policies
 from animat.training.group import Group, programs, split_groups, train_groups
 from animat.training.policy import Policy
-from animat.training.settings import SAC
+from animat.training.settings import MOST_POLICIES, SAC
 from animat.training.specification import CHUNKS, Training
 from animat.writing import exclusive_lock
 from test_simulator import responses_of
@@ -546,3 +546,9 @@ def test_the_newest_recording_is_always_used_and_those_that_are_not_are_named(
     for finding in found:
         assert ", ".join(f"{minute:g} min" for minute in unused) in finding.message
     assert lasting.unused_recordings(timeline) == replace(asked, shadowing=False).unused_recordings(timeline) == ()
+
+
+@pytest.mark.parametrize("policies", [MOST_POLICIES + 1, "2", None])
+def test_a_training_of_an_impossible_number_of_policies_lacks_none(tmp_path: Path, policies: object) -> None:
+    (tmp_path / "training.json").write_text(json.dumps({"fingerprint": "a", "training": {"policies": policies}}))
+    assert missing_policies(tmp_path) == (0, 0)

@@ -314,6 +314,35 @@ def test_records_are_found_a_slice_at_a_time(folder: Path, tmp_path: Path) -> No
     tail.close()
 
 
+def test_a_log_that_is_copied_into_its_full_length_is_read_as_far_as_it_has_come(folder: Path, tmp_path: Path) -> None:
+    log = (folder / LOG_FILE).read_bytes()
+    copy = tmp_path / LOG_FILE
+    copy.write_bytes(log[:20_000] + bytes(len(log) - 20_000))
+    tail = Tail(copy)
+    assert tail.grow(10.0)
+    assert "damaged" in tail.damage
+    so_far = len(tail)
+    copy.write_bytes(log)
+    assert tail.grow(10.0)
+    assert tail.damage == ""
+    assert 0 < so_far < len(tail)
+    tail.close()
+
+
+def test_a_length_beyond_all_records_is_damage_and_is_not_read(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = read_log(folder / LOG_FILE)
+    writer = LogWriter(tmp_path / LOG_FILE, log.header)
+    writer.append(Record({"kind": "nothing", "text": "x" * 100_000}))
+    writer.close()
+    monkeypatch.setattr("animat.watch.tail._MOST_BYTES", 90_000)
+    tail = Tail(tmp_path / LOG_FILE)
+    assert tail.grow(10.0)
+    assert (len(tail), "damaged" in tail.damage) == (1, True)
+    tail.close()
+
+
 def test_a_view_is_plain_finite_json(folder: Path) -> None:
     view = SessionView(folder)
     for found in (view.about(), whole(view), view.view(0.0, 1.0)):

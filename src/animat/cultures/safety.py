@@ -87,9 +87,7 @@ class History:
         for start_ns, end_ns, electrodes in events:
             for electrode in (None, *electrodes):
                 starts = self._starts_on[electrode]
-                if len(starts) > 1:
-                    # The last one is kept: a limit on intervals may be longer than a second.
-                    del starts[: bisect_right(starts, now_ns - NS, 0, len(starts) - 1)]
+                del starts[: bisect_right(starts, now_ns - NS)]
                 starts.append(start_ns)
             self.busy_until_ns = end_ns
 

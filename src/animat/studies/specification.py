@@ -321,12 +321,13 @@ class Study:
         read_record(SAC, self.algorithm, "algorithm")
 
     def _expect_a_choice(self) -> None:
-        settings, frequencies_hz = self.simulators, self.culture.frequencies_hz or ()
-        is_by_frequency = settings.conditions in ("", "frequency") and self.culture.places is None
-        if is_by_frequency and len(frequencies_hz) == 1 and "one-condition" not in settings.allow:
+        settings, frequencies_hz = self.simulators, self.culture.protocol().frequencies_hz
+        by = settings.conditions or ("frequency" if self.culture.places is None else "place")
+        if "one-condition" not in settings.allow and by in ("all", *["frequency"] * (len(frequencies_hz) == 1)):
             raise InvalidArgument(
-                f"culture.frequencies_hz: expected two or more for an agent to choose from, got {frequencies_hz[0]:g}; "
-                'or other simulators.conditions (to allow it: simulators.allow = ["one-condition"])'
+                "simulators.conditions: expected two or more for an agent to choose from, got one "
+                f"({'all' if by == 'all' else f'{frequencies_hz[0]:g} Hz'}): group the stimuli otherwise, or add to "
+                'culture.frequencies_hz (to allow it: simulators.allow = ["one-condition"])'
             )
 
     def arm(self, name: str) -> Arm:

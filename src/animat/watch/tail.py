@@ -70,13 +70,13 @@ class Tail:
     def grow(self, within_s: float) -> bool:
         """Find the records that were added; False if time ran out; raises InvalidFile if the file is not a log."""
         size = self._open()
-        if size == self._size:
+        if size == self._size and not self.damage:
             return True
         assert self._file is not None
         self.damage, until_s = "", time.monotonic() + within_s
         with os.fdopen(self._file, "rb", _BLOCK_BYTES, closefd=False) as file:
             file.seek(self._places[-1])
-            while (end := end_of_intact(file, self._places[-1], size)) is not None:
+            while (end := end_of_intact(file, at := self._places[-1], min(size, at + _MOST_BYTES))) is not None:
                 self._places.append(end)
                 if len(self) % _LOOKS == 0 and time.monotonic() > until_s:
                     return False
