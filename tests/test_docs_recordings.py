@@ -17,7 +17,7 @@ def test_the_examples_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     examples = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     assert len(examples) == 8
     monkeypatch.chdir(tmp_path)
-    write_synthetic_series(1, "series", sessions=2, patterns=5, channels=16)
+    write_synthetic_series(1, "recordings", sessions=2, patterns=5, channels=16)
     names: dict[str, object] = {}
     for example in examples:
         exec(compile(example, "docs/recordings.md", "exec"), names)

@@ -146,6 +146,15 @@ def test_recordings_before_the_policies_first_one_are_not_used(
     assert ("other-percentiles" in [each.name for each in other.findings]) == (not adaptive)
 
 
+def test_a_folder_with_a_session_is_refused_before_anything_is_predicted(
+    tmp_path: Path, series: list[Responses], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("animat.reality_gap.running.predict", lambda *_, **__: pytest.fail("predicted"))
+    (tmp_path / "session.log").touch()
+    with pytest.raises(InvalidArgument, match=r"session\.log: expected no session, got one"):
+        run(tmp_path, series)
+
+
 @pytest.mark.parametrize("greedy", [True, pytest.param(False, marks=pytest.mark.oracle)])
 def test_policies_are_greedy_or_draw_in_prediction_and_loop_alike(
     greedy: bool, tmp_path: Path, series: list[Responses], monkeypatch: pytest.MonkeyPatch

@@ -16,7 +16,7 @@ from animat.closed_loop.agents import Agent, Greedy, agent_of
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.runner import starts_of
 from animat.closed_loop.running import check_session, run_session
-from animat.closed_loop.session import Session
+from animat.closed_loop.session import Session, expect_no_session
 from animat.coding.encoder import electrode_pulses
 from animat.cultures.base import Culture
 from animat.cultures.budget import Account
@@ -104,12 +104,14 @@ def run_policies(
         settings: other attributes of `Loop`; by default pulse and patterns are those of the calibrating recording.
 
     Raises:
-        InvalidArgument: for no policies.
+        InvalidArgument: for no policies, or a folder with a session in it.
         Mismatch: if they differ from each other, or from the calibration's conditions.
         UnusableData: for policies without neurons.
     """
     first = check_policies(policies)
     expect_at_least("seed", seed, 0)
+    # Before minutes of prediction.
+    expect_no_session(folder)
     transfer.expect_conditions(first, calibration.conditions, calibration.readouts)
     settings = {"burst_threshold": calibration.burst_threshold, **settings}
     if calibration.adaptive:

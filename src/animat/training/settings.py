@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
+import numpy as np
 from pydantic import Field, PlainValidator
 from typing_extensions import TypedDict
 
@@ -30,6 +31,7 @@ FORMER = {
 
 def _expect_shadowing(value: Any) -> Any:
     # Not as a union, whose error would name one of the two types only.
+    value = bool(value) if isinstance(value, np.bool_) else value
     if not isinstance(value, bool) and value != "drawn":
         raise ValueError(f"expected True, False or 'drawn', got {shown(value)}")
     return value
