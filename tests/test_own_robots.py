@@ -21,7 +21,7 @@ from animat.closed_loop.agents import ActorController
 from animat.coding.checking import check_mapping
 from animat.coding.mapping import Linear, Mapping, Thresholds
 from animat.environment import Animat
-from animat.errors import InvalidArgument, UnusableData
+from animat.errors import InvalidArgument, UnusableData, first_line
 from animat.evaluation.rollouts import HeuristicPolicy
 from animat.execution.training import train
 from animat.robots import ROBOTS, Cartpole, Navigation, Quantity, Robot
@@ -288,6 +288,15 @@ def test_a_robot_of_another_size_is_trained_and_loaded(tmp_path: Path) -> None:
     robot = robot_named("cartpole", track_length_m=1e8)
     train(training(robot, "1-threshold"), timeline_of(), tmp_path)
     assert [policy.robot for policy in load_policies(tmp_path).values()] == [robot]
+
+
+def test_what_a_callback_of_jax_raises_is_said_without_its_traceback() -> None:
+    def fall_off(x: Any) -> Any:
+        raise ValueError("the wheel fell off")
+
+    with pytest.raises(jax.errors.JaxRuntimeError) as raised:
+        jax.jit(lambda x: jax.pure_callback(fall_off, jax.ShapeDtypeStruct((), np.float32), x))(1.0)
+    assert first_line(raised.value, with_place=False) == "ValueError: the wheel fell off"
 
 
 def test_a_method_that_is_missing_is_named() -> None:

@@ -160,10 +160,12 @@ def first_line(error: BaseException, *, with_place: bool = True) -> str:
 
     The place is the last line that ran in a user's own file, such as a robot's; none for code that is installed.
     """
-    line = "".join(filter(str.isprintable, str(error).strip().partition("\n")[0]))
-    return (
-        f"{type(error).__name__}: {line[:300] or 'no more is known'}{_place_in_own_file(error) if with_place else ''}"
-    )
+    first, *others = str(error).strip().split("\n")
+    message = f"{type(error).__name__}: {first[:300] or 'no more is known'}"
+    if others and first.endswith("Traceback (most recent call last):"):
+        # JAX quotes the traceback of what a callback raised; it ends with that error.
+        message = others[-1][:300]
+    return "".join(filter(str.isprintable, message)) + (_place_in_own_file(error) if with_place else "")
 
 
 def _place_in_own_file(error: BaseException) -> str:
