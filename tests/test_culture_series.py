@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from animat.cultures.same_culture import other_culture
-from animat.cultures.series import LONGEST_MIN, STATE_FILE, check_interval, minutes_of, record_series
+from animat.cultures.series import LONGEST_MIN, STATE_FILE, _read_expected, check_interval, minutes_of, record_series
 from animat.cultures.under_way import UNDER_WAY, PartialRecording
 from animat.cultures.virtual import VirtualCulture
 from animat.errors import InvalidArgument, InvalidFile, Mismatch, UnsafeStimulus
@@ -230,6 +230,13 @@ def test_a_recording_that_is_another_is_not_taken_for_it(undisturbed: list[Path]
     (other / STATE_FILE).write_bytes(b"damaged")
     with pytest.raises(InvalidFile, match=r"culture.state: expected the whole state"):
         record(other)
+
+
+def test_a_number_that_is_written_differently_is_the_same(undisturbed: list[Path]) -> None:
+    """As another version of a device's package may write its sampling rate."""
+    assert _read_expected(undisturbed[0], {"seed": "1.0"}, SHORT).equals(read_recording(undisturbed[0]))
+    with pytest.raises(Mismatch, match=r"\(seed: 1 there, 1.5 now\)"):
+        _read_expected(undisturbed[0], {"seed": "1.5"}, SHORT)
 
 
 @pytest.mark.parametrize("is_stated", [True, False])

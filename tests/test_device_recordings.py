@@ -399,3 +399,17 @@ def test_a_disk_with_room_for_the_recording_alone_takes_it(tmp_path: Path, monke
     monkeypatch.setattr("animat.cultures.series.write_nwb", full)
     (file,) = record_series(lambda: on_maxone(monkeypatch)[0], protocol, tmp_path, sessions=1).files
     assert beside == [True, False] and [each.name for each in tmp_path.iterdir()] == [file.name]
+
+
+def test_an_error_after_a_recording_is_in_its_file_leaves_no_second_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Broken:
+        def update(self, done: float, total: float, note: str = "") -> None:
+            if list(tmp_path.glob("*.nwb")):
+                raise RuntimeError("the terminal is gone")
+
+    protocol = Protocol(**vars(MIXED) | {"pulse": BALANCED_PULSE, "trials": 20})
+    with pytest.raises(RuntimeError, match="the terminal is gone"):
+        record_series(lambda: on_maxone(monkeypatch)[0], protocol, tmp_path, sessions=1, progress=Broken())
+    assert [each.name for each in tmp_path.iterdir()] == ["recording_0000_min.nwb"]

@@ -91,4 +91,7 @@ def handled(numbers: tuple[signal.Signals, ...], handler: Callable[..., None]) -
 
 
 def _is_importing(frame: FrameType | None) -> bool:
-    return any(each.f_code.co_filename == "<frozen importlib._bootstrap>" for each, _ in walk_stack(frame))
+    # Without a frame, `walk_stack` walks its own caller's.
+    return frame is not None and any(
+        each.f_code.co_filename == "<frozen importlib._bootstrap>" for each, _ in walk_stack(frame)
+    )

@@ -219,8 +219,8 @@ class Driver:
             handled="warm-up" if is_warm_up else "repeated" if again else "unfinished",
             late_s=late_s,
             decided_s=decided_s,
-            wall_s=self.clock.now_s() - self._wall_zero_s,
             neurons=() if loop.remembering is None else loop.remembering.observed(self._remembered),
+            wall_s=self.clock.now_s() - self._wall_zero_s,
             **response,
         )
         self._n_presented += 1

@@ -312,7 +312,7 @@ def _names(name: str, column: Column) -> Column:
 
 def _numbers(name: str, column: Column) -> Float64[np.ndarray, "..."]:
     if column.dtype.kind not in "fiub" and column.size:
-        raise UnusableData(f"{name}: expected numbers, got {column.dtype} (such as {column.item(0)!r})")
+        raise UnusableData(f"{name}: expected numbers, got {column.dtype} (such as {str(column.flat[0])!r})")
     return column.astype(np.float64) if column.size else np.empty(column.shape)
 
 
