@@ -10,7 +10,7 @@ from typing import Any, Literal
 from tyro.conf import Positional
 
 from animat.cli.command import Command
-from animat.errors import AnimatError, expect_at_least
+from animat.errors import AnimatError, counted, expect_at_least
 from animat.process import own_cores
 from animat.writing import expect_writable
 
@@ -33,7 +33,7 @@ class ClusterCommand(Command):
         expect_at_least("--workers", workers, 1)
         expect_writable(self.file.parent, "--file")
         with local_cluster(workers, self.file) as processes:
-            print(f"{workers} workers; to use them: --cluster {self.file}; to end them: Ctrl-C", flush=True)
+            print(f"{counted(workers, 'worker')}; to use them: --cluster {self.file}; to end them: Ctrl-C", flush=True)
             try:
                 while all(process.poll() is None for process in processes):
                     time.sleep(0.2)
