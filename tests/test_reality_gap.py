@@ -534,6 +534,19 @@ def test_a_prediction_without_the_cultures_memory_is_reported(tmp_path: Path, se
             check_policies({"p": policy_of(0, series), "q": changed})
 
 
+def test_of_an_interrupted_live_training_the_policy_that_met_the_newest_recording_calibrates(
+    series: list[Responses],
+) -> None:
+    older, newer = (
+        policy_of(i, series, provenance={"training": {"shadowing": True}, "swaps": [{"recorded_at_min": minute}]})
+        for i, minute in enumerate((0.0, 3.0))
+    )
+    assert check_policies({"p0": older, "p1": newer}) is newer
+    assert check_policies({"p0": newer, "p1": older}) is newer
+    alike = {f"p{i}": policy_of(i, series) for i in range(3)}
+    assert check_policies(alike) is alike["p0"]
+
+
 def test_what_the_loop_refuses_is_refused_before_anything_is_predicted(
     series: list[Responses], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

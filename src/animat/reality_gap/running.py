@@ -302,7 +302,9 @@ def _optimal_return(
 
 
 def check_policies(policies: Mapping[str, Policy]) -> Policy:
-    """The first of policies that can take turns in one closed loop, which represents all.
+    """One of policies that can take turns in a closed loop, which represents all: the first whose training ended last.
+
+    Those of an interrupted live training need not have met the same recordings.
 
     Raises InvalidArgument for no policies, Mismatch if they differ in more than in their networks, and UnusableData for
     policies without neurons.
@@ -311,7 +313,7 @@ def check_policies(policies: Mapping[str, Policy]) -> Policy:
     first = first_of_alike(policies, (*alike, "percentiles", "delivery", "pulse_cost"), "run it alone")
     if first.mapping is None:
         raise UnusableData("policies: expected some that act through neurons, got some that were trained without")
-    return first
+    return max(policies.values(), key=lambda policy: policy.trained_until_min(0.0) or 0.0)
 
 
 def _rows(
