@@ -53,7 +53,8 @@ class Train(SimulatorOptions, JobOptions):
     """on: refresh the simulators during training (parameter shadowing); off: the first one throughout; drawn: each
     episode draws one of those that would have been used"""
     duration_min: float | None = None
-    """Minutes of the culture's clock that training represents; default: to one interval after the last recording, with --paper 60"""
+    """Minutes of the culture's clock that training represents; default: to one interval after the last recording;
+    with --paper 60"""
     percentiles: Literal["moving", "first"] = "moving"
     """The mapping's percentiles move with the simulator, or are fixed by the first recording"""
     delivery: Literal["chosen", "shuffled"] = "chosen"
