@@ -75,11 +75,8 @@ def first_difference(
         pairs += [(len(found), len(wanted), f"{name}, how many")]
     else:
         # 1 and 1.0 are equal, but written differently, as fingerprints notice.
-        return (
-            ""
-            if found == wanted and type(found) is type(wanted)
-            else f"{name}: {_short(found)} there, {_short(wanted)} now"
-        )
+        is_same = found == wanted and type(found) is type(wanted)
+        return "" if is_same else f"{name}: {_short(found)} there, {_short(wanted)} now"
     keys: dict[str, Any] = {"ignoring": ignoring, "first": first}
     return next(filter(None, (first_difference(*pair, **keys) for pair in pairs)), "")
 

@@ -323,7 +323,8 @@ class Study:
     def _expect_a_choice(self) -> None:
         settings, frequencies_hz = self.simulators, self.culture.protocol().frequencies_hz
         by = settings.conditions or ("frequency" if self.culture.places is None else "place")
-        if "one-condition" not in settings.allow and by in ("all", *["frequency"] * (len(frequencies_hz) == 1)):
+        is_one = by == "all" or (by == "frequency" and len(frequencies_hz) == 1)
+        if is_one and "one-condition" not in settings.allow:
             raise InvalidArgument(
                 "simulators.conditions: expected two or more for an agent to choose from, got one "
                 f"({'all' if by == 'all' else f'{frequencies_hz[0]:g} Hz'}): group the stimuli otherwise, or add to "
