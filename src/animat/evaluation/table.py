@@ -175,7 +175,7 @@ class Evaluation:
         if self.objectives:
             lines.append(f"  {satisfaction_line(self.objectives, self.rows[0].met)}")
         if self.verdict is not None:
-            lines.append(f"  {self.verdict}")
+            lines.append(f"  {'by return, without the cost: ' if cost else ''}{self.verdict}")
         if self.not_met:
             outlook = "it is not known whether a closed loop on the culture would reach these returns"
             if self.not_met != (transfer.UNKNOWN,):

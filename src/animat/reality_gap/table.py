@@ -180,7 +180,8 @@ class RealityGap:
             lines.append(f"  the optimal return on this simulator is at most about {self.optimum:.1f}{share}")
         if cost:
             ignores = "" if self.optimum is None else "; the optimal return ignores the cost"
-            lines.append(f"  electrode pulses: per episode; net: return - {cost:g} x electrode pulses{ignores}")
+            net = f"net: return - {cost:g} x electrode pulses, which comparisons with controls ignore{ignores}"
+            lines.append(f"  electrode pulses: per episode; {net}")
         lines += [f"  {finding.message}" for finding in self.findings if finding.name in ("no-optimum", "no-heuristic")]
         outline = self.session.outline
         lines += [
