@@ -76,7 +76,7 @@ def test_the_examples_in_python_run(
     for written, short in (
         ("trials=1000", "trials=40"),
         ("policies=4, iterations=400_000", "policies=2, iterations=6_400"),
-        ('"session")', '"session", episodes=1, with_controls=False)'),
+        ('"session-2")', '"session-2", episodes=1, with_controls=False)'),
     ):
         assert written in shorter
         shorter = shorter.replace(written, short)
