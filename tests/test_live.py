@@ -392,8 +392,10 @@ def test_a_culture_that_fails_meanwhile_is_stopped_and_what_was_trained_is_kept(
         raise DeviceFailed("gone")
 
     with FakeCulture(fault=fail, at=1) as culture:
-        with pytest.raises(DeviceFailed, match="gone"):
+        with pytest.raises(DeviceFailed, match="gone") as raised:
             live(ONE, culture, PROTOCOL, tmp_path / "live", timetable=QUICK)
+        kept = f"animat run {tmp_path}/live/policies --recordings {tmp_path}/live/recordings"
+        assert raised.value.__notes__ == [f"what was trained so far can still be run: {kept}"]
         assert culture.is_stopped
         assert culture.after_halt == 0
         # The second recording was handed over: nobody knows what came of it.

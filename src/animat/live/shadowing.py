@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import shlex
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -148,6 +149,10 @@ def live(
         run.end_early(error)
         with suppress(InvalidFile):
             run.write("end", budget=run.account.to_dict())
+        if any((run.folder / POLICIES).glob("p*.safetensors")):
+            of = str(run.folder / POLICIES), "--recordings", str(run.folder / RECORDINGS)
+            command = shlex.join(("animat", "run", *of))
+            error.add_note(f"what was trained so far can still be run: {command}")
         raise
     run.write("end", budget=run.account.to_dict())
     return LiveRun(tuple(run.files), policies, tuple(run.swaps), run.iterations, run.culture_min, run.wall_s, gap)
