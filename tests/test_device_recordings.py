@@ -401,6 +401,7 @@ def test_a_disk_with_room_for_the_recording_alone_takes_it(tmp_path: Path, monke
     assert beside == [True, False] and [each.name for each in tmp_path.iterdir()] == [file.name]
 
 
+@pytest.mark.oracle
 def test_an_error_after_a_recording_is_in_its_file_leaves_no_second_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -19,6 +19,7 @@ from animat.recordings.recorded_culture import RecordedCulture
 from synthetic_recordings import synthetic_recording
 
 
+@pytest.mark.oracle
 def test_recordings_of_rigs_are_placed_by_their_dates(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     first, second, undated = (tmp_path / f"{name}.nwb" for name in ("z", "a", "undated"))
     recording = synthetic_recording(1, patterns=20, channels=32)

@@ -663,6 +663,7 @@ def test_readouts_are_scored_each(recorded: Path, tmp_path: Path, capsys: pytest
     assert "left, right: " in printed
 
 
+@pytest.mark.oracle
 def test_figures_are_in_the_folder_whatever_readouts_are_called(recorded: Path, tmp_path: Path) -> None:
     file, figures = recorded / "recording_0000_min.nwb", tmp_path / "figures"
     electrodes = read_recording(file).channels.electrode.tolist()
