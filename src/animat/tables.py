@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float64, Int64
+from numpy.typing import ArrayLike
 
 from animat.errors import UnusableData, shown
 
@@ -39,15 +40,21 @@ def read_only(table: object, attribute: str, dtype: Any = None) -> np.ndarray[An
     try:
         given = np.asarray(value)
         with np.errstate(invalid="ignore"):
-            array = np.array(given, dtype=dtype)
+            array = read_only_copy(given, dtype)
     except (TypeError, ValueError):
         # Text, None, or rows of different lengths.
         raise UnusableData(f"{attribute}: expected an array of numbers, got {shown(value)}") from None
     if array.dtype.kind == "i" and given.dtype.kind in "fu" and np.any(differ := array != given):
         raise UnusableData(f"{attribute}: expected whole numbers, got {given[differ][0]:g}")
-    array.setflags(write=False)
     object.__setattr__(table, attribute, array)
     return array
+
+
+def read_only_copy(array: ArrayLike, dtype: Any = None) -> np.ndarray[Any, Any]:
+    """A read-only copy of an array."""
+    own = np.array(array, dtype=dtype)
+    own.setflags(write=False)
+    return own
 
 
 MOST_PADDED = 50_000_000

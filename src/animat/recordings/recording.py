@@ -124,9 +124,9 @@ class Recording:
             raise UnusableData(f"spike_channels: expected {expected}, got {got}")
         # Files store spikes by channel: without a fixed order of ties, a recording would not read back equal.
         if np.any((np.diff(self.spike_times_s) == 0) & (np.diff(self.spike_channels) < 0)):
-            channels = self.spike_channels[np.lexsort((self.spike_channels, self.spike_times_s))]
-            channels.setflags(write=False)
-            object.__setattr__(self, "spike_channels", channels)
+            order = np.lexsort((self.spike_channels, self.spike_times_s))
+            object.__setattr__(self, "spike_channels", self.spike_channels[order])
+            read_only(self, "spike_channels")
         # Events up to a century before and after 0 are up to two centuries apart.
         if not (abs(self.start_s) <= CENTURY_S and 0 <= self.duration_s <= 2 * CENTURY_S):
             length = ", the latter 0 or more" if self.duration_s < 0 else ""

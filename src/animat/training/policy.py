@@ -32,7 +32,7 @@ from animat.responses.windows import check_window
 from animat.robots.base import LARGEST_SCALE, LEAST_SCALE, Robot
 from animat.robots.registry import REGISTRY as ROBOTS
 from animat.stimulation.protocol import Presentation
-from animat.tables import briefly
+from animat.tables import briefly, read_only_copy
 from animat.training.settings import PulseCost, expect_provenance
 from animat.writing import write_whole
 
@@ -120,9 +120,9 @@ class Policy:
         expect_provenance(self.provenance)
         # As in recordings: a policy that was checked stays what it is.
         for name in ("weights", "biases"):
-            vars(self)[name] = tuple(map(_read_only, getattr(self, name)))
+            vars(self)[name] = tuple(map(read_only_copy, getattr(self, name)))
         for name in ("scales", "learning_curve", "assessments"):
-            vars(self)[name] = _read_only(getattr(self, name))
+            vars(self)[name] = read_only_copy(getattr(self, name))
         if self.mapping is not None:
             expect_fit(self.robot.name, self.robot.n_commands, len(self.readouts))
 
@@ -391,9 +391,3 @@ def load_policies(path: str | os.PathLike[str]) -> dict[str, Policy]:
     if not files:
         raise InvalidFile(f"{path}: expected policies (*.safetensors) in the folder, got none; train them first")
     return {file.stem: Policy.load(file) for file in files}
-
-
-def _read_only(array: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-    own = np.array(array)
-    own.setflags(write=False)
-    return own

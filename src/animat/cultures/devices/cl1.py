@@ -26,7 +26,7 @@ from animat.recordings.recording import Channels
 from animat.stimulation.array import ElectrodeArray
 from animat.stimulation.patterns import draw_patterns
 from animat.stimulation.pulse import Phase, Pulse
-from animat.tables import UNKNOWN, padded
+from animat.tables import UNKNOWN, padded, read_only_copy
 
 CL1_LIMITS = Limits(
     kind="current",
@@ -267,6 +267,4 @@ def _check_patterns(patterns: Patterns) -> Int64[np.ndarray, "patterns size"]:
             raise InvalidArgument(f"{expected}, got channel {strange[0]} in number {number}, which is {what}")
     if not rows:
         raise InvalidArgument("patterns: expected at least one, got none")
-    table = padded(rows)
-    table.setflags(write=False)
-    return table
+    return read_only_copy(padded(rows))
