@@ -13,8 +13,8 @@ from jaxtyping import Array, Float, Float64
 
 from animat.environment import Animat, Environment
 from animat.errors import InvalidArgument, shown
+from animat.evaluation.controllers import Called, Controller, acts, sees_neurons
 from animat.evaluation.controls import RANDOM, Control, Delivered
-from animat.evaluation.own_agents import Called, Controller, acts, sees_neurons
 from animat.evaluation.rollouts import Actor, Constant, Networks, Uniform
 
 

@@ -27,7 +27,7 @@ from animat.cultures.base import Culture
 from animat.cultures.budget import Account
 from animat.cultures.failures import describe_error
 from animat.errors import AnimatError, BudgetSpent
-from animat.evaluation.own_agents import Controller, begun
+from animat.evaluation.controllers import Controller, begun
 from animat.neurons.history_tracker import HistoryState
 from animat.responses.extraction import SILENCE_S
 from animat.robots.starts import robot_generator

@@ -15,6 +15,7 @@ from animat import wrappers
 from animat.environment import Animat, Environment, Neurons
 from animat.errors import within
 from animat.evaluation.commands import mean_commands
+from animat.evaluation.controllers import Called
 from animat.evaluation.coupling import best_coupling
 from animat.evaluation.rollouts import Actor, Constant, Episodes, Networks, Uniform, heuristic_policy, roll_out
 from animat.evaluation.statistics import standard_error
@@ -33,7 +34,7 @@ class Control:
 
     Attributes:
         name: `random`, `constant 5 Hz`, `heuristic`, `silent` or `shuffled`, or the name of an intervention.
-        actor: one actor, or the policies side by side.
+        actor: one actor, or the policies side by side; or a controller outside JAX.
         delivery: `"chosen"`: neurons get what was chosen; `"shuffled"`: a condition drawn at random in each iteration;
             `"silent"`: nothing; `"yoked"`: the stimuli of another episode.
         is_drawn: whether a random recorded response replaces the neurons' own.
@@ -44,7 +45,7 @@ class Control:
 
     name: str
     meaning: str
-    actor: Actor
+    actor: Actor | Called
     delivery: Delivered = "chosen"
     is_drawn: bool = False
     is_turned_round: bool = False
@@ -85,9 +86,7 @@ class Control:
         """Its episodes in the policies' environment and simulator, changed for it; errors as in `roll_out`."""
         changed = self.within(environment, simulator)
         with within(f"agents: {self.name}") if self.meaning == OWN else nullcontext():
-            ran = roll_out(*changed, self.actor, episodes=episodes, seed=seed, starts=starts)
-        self.actor.expect_no_failure()
-        return ran
+            return roll_out(*changed, self.actor, episodes=episodes, seed=seed, starts=starts)
 
 
 RANDOM = Control("random", "any action, equally likely", Uniform())

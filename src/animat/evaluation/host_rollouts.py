@@ -9,11 +9,12 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray
+from jaxtyping import Array, Float, Key, PRNGKeyArray
 
 from animat.compilation import COMPILER_OPTIONS
 from animat.environment import Environment, Neurons, State
 from animat.errors import InvalidArgument
+from animat.evaluation.controllers import Called, Turns
 from animat.robots.host import Bodies, HostRobot, StepResult
 from animat.robots.starts import Starts
 
@@ -68,7 +69,6 @@ def roll_out_on_host(
             folded = jax.vmap(jax.random.fold_in, (0, None))(keys[some], first)
             of_episodes = (each[some, first : first + side_by_side] for each in counts[:3])
             wave = Counts(*of_episodes, *(each[some] for each in counts[3:]))
-            actors.begin()
             _count_wave(environment, simulator, acting, folded, seeds, wave)
     return counts
 
@@ -90,8 +90,6 @@ def paths_on_host(
             commands[number, lengths[number]] = command[0].reshape(robot.command_shape)
             lengths[number] += 1
             observations[number, lengths[number] :] = stepped.observation
-            if stepped.ended[0]:
-                break
     return observations, commands, lengths
 
 
@@ -125,8 +123,6 @@ def _count_wave(
             np.add.at(counts.presented, at, 1)
             np.add.at(commanded, at, command[:, :n][going])
         going &= ~ended
-        if not going.any():
-            break
     counts.commanded[:] += commanded
 
 
@@ -135,20 +131,29 @@ def _iterations(
 ) -> Iterator[tuple[np.ndarray, np.ndarray, StepResult]]:
     """Commands, delivered conditions and results of each iteration of begun bodies; ended episodes begin again.
 
-    Of each actor's bodies the first `n` count, until they first end.
+    Of each actor's bodies the first `n` count, until they first end; a controller is asked for those only.
     """
     shape = len(keys), len(bodies) // len(keys)
     state = _started(environment, keys, shape[1])
     going = np.tile(np.arange(shape[1]) < n, (len(keys), 1))
+    turns = Turns(actors, environment) if isinstance(actors, Called) else None
     for iteration in range(environment.robot.episode_limit):
-        state = state._replace(robot=bodies.observation.reshape(*shape, -1))
-        given = environment, simulator, actors, keys, np.int32(iteration), state, going.copy()
-        command, state, delivered = actors.apart(lambda given=given: jax.block_until_ready(_iteration(*given)))
+        state, number = state._replace(robot=bodies.observation.reshape(*shape, -1)), np.int32(iteration)
+        if turns is None:
+            command, state, delivered = _iteration(environment, simulator, actors, keys, number, state)
+        else:
+            *seen, noise = _look_in_jit(environment, keys, number, state)
+            chosen = turns.choose(*(np.asarray(each[0]) for each in (*seen, going)))
+            command, state, delivered = _respond_in_jit(environment, simulator, state, chosen[None], noise)
         stepped = bodies.step(np.asarray(command).reshape(len(bodies), -1))
         yield np.asarray(command), np.asarray(delivered), stepped
         going &= ~stepped.ended.reshape(shape)
+        if not going.any():
+            break
         if stepped.ended.any():
             bodies.begin(np.flatnonzero(stepped.ended).tolist())
+    if turns is not None:
+        turns.end()
 
 
 def _bodies(robot: HostRobot, seeds: Sequence[tuple[int, ...]]) -> Bodies:
@@ -165,6 +170,25 @@ def _started(environment: Environment[Any], keys: Key[Array, " actors"], episode
     return jax.vmap(lambda key: jax.vmap(environment.reset)(jax.random.split(key, episodes)).carried)(keys)
 
 
+def _look(
+    environment: Environment[Any], iteration: Array, key: PRNGKeyArray, state: State
+) -> tuple[Float[Array, "episodes observations"], Float[Array, "episodes drawn"], Float[Array, "episodes noise"]]:
+    """Observations (scaled), and uniforms for an actor and for the environment."""
+    n, n_drawn = len(state.iteration), environment.n_drawn
+    shape = n, n_drawn + environment.noise_size
+    uniforms = jax.random.uniform(jax.random.fold_in(key, iteration), shape, np.float32)
+    return jax.vmap(environment.observe)(state) / environment.scales, uniforms[:, :n_drawn], uniforms[:, n_drawn:]
+
+
+def _respond(
+    environment: Environment[Any], simulator: Neurons, state: State, action: Array, noise: Array
+) -> tuple[Float[Array, "episodes *commands"], State, Array]:
+    """Commands, the next state, and the delivered conditions."""
+    responding = jax.vmap(environment.respond, (0, 0, 0, None))
+    delivered, answer, command = responding(noise, state, action, simulator)
+    return command, state._replace(iteration=state.iteration + 1, neurons=answer.history), delivered
+
+
 @partial(jax.jit, static_argnums=0, compiler_options=COMPILER_OPTIONS)
 def _iteration(
     environment: Environment[Any],
@@ -173,19 +197,25 @@ def _iteration(
     keys: Key[Array, " actors"],
     iteration: Array,
     state: State,
-    going: Bool[Array, "actors episodes"],
 ) -> tuple[Float[Array, "actors episodes *commands"], State, Array]:
-    """Commands, the next state, and the delivered conditions."""
+    def of_actor(actor: Any, key: PRNGKeyArray, state: State) -> tuple[Array, State, Array]:
+        observation, uniforms, noise = _look(environment, iteration, key, state)
+        return _respond(environment, simulator, state, actor.act(environment, observation, uniforms), noise)
 
-    def of_actor(actor: Any, key: PRNGKeyArray, state: State, going: Array) -> tuple[Array, State, Array]:
-        n, n_drawn = len(state.iteration), environment.n_drawn
-        shape = n, n_drawn + environment.noise_size
-        uniforms = jax.random.uniform(jax.random.fold_in(key, iteration), shape, np.float32)
-        observation = jax.vmap(environment.observe)(state) / environment.scales
-        action = actor.act_while(environment, observation, uniforms[:, :n_drawn], going)
-        delivered, answer, command = jax.vmap(environment.respond, (0, 0, 0, None))(
-            uniforms[:, n_drawn:], state, action, simulator
-        )
-        return command, state._replace(iteration=state.iteration + 1, neurons=answer.history), delivered
+    return jax.vmap(of_actor)(actors, keys, state)
 
-    return jax.vmap(of_actor)(actors, keys, state, going)
+
+@partial(jax.jit, static_argnums=0, compiler_options=COMPILER_OPTIONS)
+def _look_in_jit(
+    environment: Environment[Any], keys: Key[Array, " actors"], iteration: Array, state: State
+) -> tuple[Array, ...]:
+    """As `_look` for each actor, with observations in the robot's own units."""
+    observation, *uniforms = jax.vmap(partial(_look, environment, iteration))(keys, state)
+    return observation * environment.scales, *uniforms
+
+
+@partial(jax.jit, static_argnums=0, compiler_options=COMPILER_OPTIONS)
+def _respond_in_jit(
+    environment: Environment[Any], simulator: Neurons, state: State, action: Array, noise: Array
+) -> tuple[Array, State, Array]:
+    return jax.vmap(partial(_respond, environment, simulator))(state, action, noise)

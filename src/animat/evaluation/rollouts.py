@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple, TypeVar, final
+from typing import Any, NamedTuple, final
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +17,7 @@ from animat.compilation import COMPILER_OPTIONS
 from animat.environment import Environment, Neurons, State
 from animat.errors import InvalidArgument, expect_at_least, shown
 from animat.evaluation.commands import mean_commands
+from animat.evaluation.controllers import Called, Turns
 from animat.evaluation.host_rollouts import roll_out_on_host
 from animat.goals.robot import RobotWithGoal
 from animat.goals.tally import Outcome
@@ -28,7 +29,6 @@ from animat.tables import briefly
 from animat.training.networks import Layer, Network, as_commands, draw_action, likeliest_action
 from animat.training.policy import Policy
 
-T = TypeVar("T")
 Seen = Float[Array, "episodes observations"]
 Uniforms = Float[Array, "episodes drawn"]
 
@@ -45,23 +45,6 @@ class Actor(abc.ABC):
         """How many run side by side: the length of the first axis of all its arrays; 1 without arrays."""
         arrays = jax.tree.leaves(self)
         return len(arrays[0]) if arrays else 1
-
-    def act_while(
-        self, environment: Environment[Any], observation: Seen, uniforms: Uniforms, going: Bool[Array, " episodes"]
-    ) -> Array:
-        """The same, where an action counts only in the episodes that are `going`."""
-        return self.act(environment, observation, uniforms)
-
-    # Only actors that call something outside JAX can fail, remember, or take long.
-    def begin(self) -> None:  # noqa: B027
-        """Forget the episodes so far, as new ones begin."""
-
-    def apart(self, run: Callable[[], T]) -> T:
-        """Run episodes in JAX such that Ctrl-C ends them soon; in another thread, without settings of this one."""
-        return run()
-
-    def expect_no_failure(self) -> None:  # noqa: B027
-        """Raise InvalidArgument if it failed to act since the last call."""
 
 
 @final
@@ -208,7 +191,7 @@ def networks_of(policies: Sequence[Policy], *, greedy: bool = False) -> Networks
 def roll_out(
     environment: Environment[Any],
     simulator: Neurons,
-    actors: Actor,
+    actors: Actor | Called,
     *,
     episodes: int,
     seed: int,
@@ -218,7 +201,7 @@ def roll_out(
     """Run episodes of several actors on one simulator.
 
     Args:
-        actors: one kind of actor, its arrays with a leading axis of actors.
+        actors: one kind of actor, its arrays with a leading axis of actors; or a controller outside JAX.
         seed: decides every random draw, together with an actor's place.
         alike: whether all actors get the same random numbers, so that only their actions differ.
         starts: where episodes start, those of the first round first; None: as the robot draws them.
@@ -235,13 +218,75 @@ def roll_out(
             *roll_out_on_host(environment, episodes, simulator, actors, keys, seed, alike=alike, starts=starts)
         )
     of_episodes = None if starts is None else starts.of_episodes(episodes)
-    actors.begin()
-    *counted, terminated, outcome = actors.apart(
-        lambda: jax.device_get(_roll_out(environment, episodes, simulator, actors, keys, of_episodes))
-    )
+    if isinstance(actors, Called):
+        ran = _call_out(environment, episodes, simulator, actors, keys[0], of_episodes)
+    else:
+        ran = _roll_out(environment, episodes, simulator, actors, keys, of_episodes)
+    *counted, terminated, outcome = jax.device_get(ran)
     kinds = (np.float64, np.int64, np.int64, np.float64)
     returns, lengths, presented, commanded = (x.astype(kind) for x, kind in zip(counted, kinds, strict=True))
     return Episodes(returns, lengths, terminated, presented, commanded, outcome)
+
+
+class _Course(NamedTuple):
+    """An actor's episodes under way; those that have ended are carried along, but no longer counted."""
+
+    state: State
+    going: Bool[Array, " episodes"]
+    returns: Float[Array, " episodes"]
+    lengths: Int[Array, " episodes"]
+    presented: Int[Array, " conditions"]
+    commanded: Float[Array, "conditions *commands"]
+    terminated: Bool[Array, " episodes"]
+
+
+def _begin(
+    environment: Environment[Any], episodes: int, simulator: Neurons, key: PRNGKeyArray, starts: Any
+) -> tuple[_Course, Key[Array, " iterations"]]:
+    """The episodes before their first iteration, and a key for each iteration."""
+    n_conditions = 0 if simulator is None or environment.n_actions is None else environment.n_actions
+    start, key = jax.random.split(key)
+    course = _Course(
+        jax.vmap(environment.reset)(jax.random.split(start, episodes) if starts is None else starts).carried,
+        jnp.ones(episodes, bool),
+        jnp.zeros(episodes),
+        jnp.zeros(episodes, jnp.int32),
+        jnp.zeros(n_conditions, jnp.int32),
+        jnp.zeros((n_conditions, *environment.robot.command_shape)),
+        jnp.zeros(episodes, bool),
+    )
+    return course, jax.random.split(key, environment.robot.episode_limit)
+
+
+def _look(environment: Environment[Any], course: _Course, key: PRNGKeyArray) -> tuple[Seen, Uniforms, Array]:
+    """Observations (scaled), and uniforms for an actor and for the environment."""
+    n_drawn = environment.n_drawn
+    uniforms = jax.random.uniform(key, (len(course.going), n_drawn + environment.noise_size), jnp.float32)
+    observation = jax.vmap(environment.observe)(course.state) / environment.scales
+    return observation, uniforms[:, :n_drawn], uniforms[:, n_drawn:]
+
+
+def _advance(
+    environment: Environment[Any], simulator: Neurons, course: _Course, action: Array, noise: Array
+) -> _Course:
+    state, going, returns, lengths, presented, commanded, terminated = course
+    after = jax.vmap(environment.advance, (0, 0, 0, None))(noise, state, action, simulator)
+    returns = returns + jnp.where(going, after.reward, 0.0)
+    terminated = terminated | (going & after.ended.terminated)
+    lengths = lengths + going
+    if simulator is not None:
+        delivered = going[:, None] & (after.info["delivered"][:, None] == jnp.arange(len(presented)))
+        presented = presented + delivered.sum(axis=0, dtype=jnp.int32)
+        commanded = commanded + jnp.tensordot(delivered.T.astype(jnp.float32), after.info["command"], 1)
+    going = going & ~jnp.logical_or(*after.ended)
+    return _Course(after.carried, going, returns, lengths, presented, commanded, terminated)
+
+
+def _results(environment: Environment[Any], course: _Course) -> tuple[Any, ...]:
+    """What is counted, and the outcome for a robot with a goal."""
+    robot = environment.robot
+    outcome = jax.vmap(jax.vmap(robot.outcome))(course.state.robot) if isinstance(robot, RobotWithGoal) else None
+    return *course[2:], outcome
 
 
 @partial(jax.jit, static_argnums=(0, 1), compiler_options=COMPILER_OPTIONS)
@@ -253,50 +298,51 @@ def _roll_out(
     keys: Key[Array, " actors"],
     starts: Key[Array, " episodes"] | None,
 ) -> tuple[Any, ...]:
-    n_conditions = 0 if simulator is None or environment.n_actions is None else environment.n_actions
-    n_drawn = environment.n_drawn
-
-    def begin(key: PRNGKeyArray) -> tuple[tuple[Any, ...], Key[Array, " iterations"]]:
-        start, key = jax.random.split(key)
-        carry = (
-            jax.vmap(environment.reset)(jax.random.split(start, episodes) if starts is None else starts).carried,
-            jnp.ones(episodes, bool),
-            jnp.zeros(episodes),
-            jnp.zeros(episodes, jnp.int32),
-            jnp.zeros(n_conditions, jnp.int32),
-            jnp.zeros((n_conditions, *environment.robot.command_shape)),
-            jnp.zeros(episodes, bool),
-        )
-        return carry, jax.random.split(key, environment.robot.episode_limit)
-
-    def iteration(carry: tuple[Any, ...], actor: Actor, key: PRNGKeyArray) -> tuple[Any, ...]:
-        state, going, returns, lengths, presented, commanded, terminated = carry
-        uniforms = jax.random.uniform(key, (episodes, n_drawn + environment.noise_size), jnp.float32)
-        observation = jax.vmap(environment.observe)(state) / environment.scales
-        action = actor.act_while(environment, observation, uniforms[:, :n_drawn], going)
-        after = jax.vmap(environment.advance, (0, 0, 0, None))(uniforms[:, n_drawn:], state, action, simulator)
-        # An ended episode is carried along, but no longer counted.
-        returns = returns + jnp.where(going, after.reward, 0.0)
-        terminated = terminated | (going & after.ended.terminated)
-        lengths = lengths + going
-        if simulator is not None:
-            delivered = going[:, None] & (after.info["delivered"][:, None] == jnp.arange(n_conditions))
-            presented = presented + delivered.sum(axis=0, dtype=jnp.int32)
-            commanded = commanded + jnp.tensordot(delivered.T.astype(jnp.float32), after.info["command"], 1)
-        going = going & ~jnp.logical_or(*after.ended)
-        return after.carried, going, returns, lengths, presented, commanded, terminated
+    def iteration(course: _Course, actor: Actor, key: PRNGKeyArray) -> _Course:
+        observation, uniforms, noise = _look(environment, course, key)
+        return _advance(environment, simulator, course, actor.act(environment, observation, uniforms), noise)
 
     # The loop is outside the `vmap` and ends with the last episode: controls fail long before the limit.
-    first, of_iteration = jax.vmap(begin)(keys)
+    first, of_iteration = jax.vmap(lambda key: _begin(environment, episodes, simulator, key, starts))(keys)
     each = jax.vmap(iteration)
-    _, (last, _, *counted) = jax.lax.while_loop(
-        lambda at: (at[0] < environment.robot.episode_limit) & jnp.any(at[1][1]),
+    _, last = jax.lax.while_loop(
+        lambda at: (at[0] < environment.robot.episode_limit) & jnp.any(at[1].going),
         lambda at: (at[0] + 1, each(at[1], actors, of_iteration[:, at[0]])),
         (0, first),
     )
-    robot = environment.robot
-    outcome = jax.vmap(jax.vmap(robot.outcome))(last.robot) if isinstance(robot, RobotWithGoal) else None
-    return *counted, outcome
+    return _results(environment, last)
+
+
+def _call_out(
+    environment: Environment[Any],
+    episodes: int,
+    simulator: Neurons,
+    called: Called,
+    key: PRNGKeyArray,
+    starts: Key[Array, " episodes"] | None,
+) -> tuple[Any, ...]:
+    """The same for a controller outside JAX, with the same random numbers."""
+    turns = Turns(called, environment)
+    course, of_iteration = _begin_in_jit(environment, episodes, simulator, key, starts)
+    for each in of_iteration:
+        observation, uniforms, noise = _look_in_jit(environment, course, each)
+        chosen = turns.choose(*map(np.asarray, (observation, uniforms, course.going)))
+        course = _advance_in_jit(environment, simulator, course, chosen, noise)
+        if not np.any(course.going):
+            break
+    turns.end()
+    return _results(environment, jax.tree.map(lambda part: part[None], course))
+
+
+_begin_in_jit = jax.jit(_begin, static_argnums=(0, 1), compiler_options=COMPILER_OPTIONS)
+_advance_in_jit = jax.jit(_advance, static_argnums=0, compiler_options=COMPILER_OPTIONS)
+
+
+@partial(jax.jit, static_argnums=0, compiler_options=COMPILER_OPTIONS)
+def _look_in_jit(environment: Environment[Any], course: _Course, key: PRNGKeyArray) -> tuple[Seen, Uniforms, Array]:
+    """As `_look`, with observations in the robot's own units."""
+    observation, uniforms, noise = _look(environment, course, key)
+    return observation * environment.scales, uniforms, noise
 
 
 class Traces(NamedTuple):

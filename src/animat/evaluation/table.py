@@ -15,12 +15,13 @@ from animat.columns import align_columns
 from animat.environment import Animat, Environment, Neurons, WithoutNeurons
 from animat.errors import InvalidArgument, Mismatch, UnusableData, counted, in_min
 from animat.evaluation import transfer
+from animat.evaluation.controllers import Controller
 from animat.evaluation.controls import Control, Row, controls_of, coupling_of
 from animat.evaluation.coupling import ContextGap, context_gap, least_context_gap
 from animat.evaluation.interventions import InterventionTable, run_interventions
 from animat.evaluation.optimal_returns import WellSampled
 from animat.evaluation.optimum import Optimum, best_return
-from animat.evaluation.own_agents import Controller, controls_of_own
+from animat.evaluation.own_agents import controls_of_own
 from animat.evaluation.rollouts import Actor, networks_of
 from animat.evaluation.statistics import Interval, Verdict, normalised_score
 from animat.goals.robot import objectives_of

@@ -15,8 +15,8 @@ from jaxtyping import Float64
 
 from animat.environment import Environment
 from animat.errors import some_of
+from animat.evaluation.controllers import Called
 from animat.evaluation.controls import Control, Delivered
-from animat.evaluation.own_agents import Called
 from animat.evaluation.rollouts import Episodes, Uniform
 from animat.evaluation.statistics import Interval
 from animat.process import own_cores
@@ -179,6 +179,6 @@ def _with_random_actor(control: Control) -> Control:
     return replace(control, actor=Uniform(), delivery=delivery)
 
 
-def _program_of(control: Control) -> tuple[Hashable, ...]:
+def _program_of(control: Control) -> Hashable:
     """What determines the compiled program of its episodes."""
     return type(control.actor), control.delivery, control.is_drawn, control.is_turned_round, control.switch_at

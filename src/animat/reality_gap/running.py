@@ -25,10 +25,11 @@ from animat.cultures.same_culture import differences
 from animat.environment import Animat, Environment
 from animat.errors import InvalidArgument, InvalidFile, UnusableData, expect_at_least
 from animat.evaluation import transfer
+from animat.evaluation.controllers import Controller
 from animat.evaluation.controls import RANDOM, Control, controls_of, coupling_of, interventions_of
 from animat.evaluation.optimal_returns import too_few
 from animat.evaluation.optimum import optimal_values
-from animat.evaluation.own_agents import Controller, controls_of_own
+from animat.evaluation.own_agents import controls_of_own
 from animat.evaluation.rollouts import Actor, networks_of
 from animat.evaluation.statistics import compare_episodes
 from animat.goals.tally import Outcome
