@@ -102,11 +102,11 @@ def outcome(objectives: Sequence[Objective], tally: Tally, episode_limit: int) -
     # One by one: where many are divided by one number, XLA multiplies by its reciprocal, which is rounded.
     there = jnp.stack([inside / out_of for inside in tally.inside])
     satisfaction = jnp.where(avoids, avoided, jnp.where(reaches, 1.0 + jnp.minimum(margins, 0.0), there))
-    worst = jnp.min(margins)
     if reaches.any():
         # Reaching a region ends the episode, and suffices unless the episode has failed.
-        met, margin = tally.reached, jnp.min(margins, where=avoids, initial=jnp.max(margins[reaches]))
+        late = np.array([objective.within is not None for objective in objectives])
+        decides = avoids | (late & tally.failed)
+        met, margin = tally.reached, jnp.min(margins, where=decides, initial=jnp.max(margins[reaches]))
     else:
-        met, margin = jnp.all(tally.is_inside | avoids), worst
-    # The objective that failed need not be among those that decide when none fails.
-    return Outcome(met & ~tally.failed, 100 * satisfaction, jnp.where(tally.failed, worst, margin))
+        met, margin = jnp.all(tally.is_inside | avoids), jnp.min(margins)
+    return Outcome(met & ~tally.failed, 100 * satisfaction, margin)
