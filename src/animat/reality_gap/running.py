@@ -5,19 +5,20 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
+from jaxtyping import Float64
 
 from animat.arguments import checked_arguments
 from animat.closed_loop.agents import Agent, Greedy, agent_of
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.runner import starts_of
 from animat.closed_loop.running import check_session, run_session
-from animat.closed_loop.session import Session, expect_no_session
-from animat.coding.encoder import electrode_pulses
+from animat.closed_loop.session import expect_no_session
 from animat.cultures.base import Culture
 from animat.cultures.budget import Account
 from animat.cultures.failures import describe_error
@@ -29,16 +30,15 @@ from animat.evaluation.controls import RANDOM, Control, controls_of, coupling_of
 from animat.evaluation.optimal_returns import too_few
 from animat.evaluation.optimum import optimal_values
 from animat.evaluation.own_agents import Controller, controls_of_own
-from animat.evaluation.rollouts import Actor, networks_of
-from animat.evaluation.statistics import compare_episodes
-from animat.goals.tally import Outcome
+from animat.evaluation.rollouts import Actor, Networks, networks_of
+from animat.neurons.simulator import NeuronSimulator
 from animat.progress import Progress, in_phase
 from animat.reality_gap.calibration import Calibration
+from animat.reality_gap.measuring import rows_of
 from animat.reality_gap.outlook import outlook
-from animat.reality_gap.predicting import EPISODES, MOST_ON_HOST, Prediction, few_predicted, pool, predict
+from animat.reality_gap.predicting import EPISODES, MOST_ON_HOST, few_predicted, pool, predict
 from animat.reality_gap.reasons import Evidence, reasons
-from animat.reality_gap.row import Row
-from animat.reality_gap.session_responses import outcomes, read_responses
+from animat.reality_gap.session_responses import read_responses
 from animat.reality_gap.table import INTERVENTION_EPISODES, RealityGap, intervention_table
 from animat.recordings.findings import Finding, warnings_once
 from animat.robots.base import Robot, lacking
@@ -48,6 +48,8 @@ from animat.robots.starts import Starts
 from animat.training.policy import Policy, first_of_alike
 from animat.wrappers import NeuralObservation
 from animat.writing import expect_writable
+
+T = TypeVar("T")
 
 FEWEST_OF_A_CONTROL = 5
 """Fewest episodes of a control: enough to show (p < 0.01) that policies with ten or more outperform it."""
@@ -113,32 +115,18 @@ def run_policies(
     # Before minutes of prediction.
     expect_no_session(folder)
     transfer.expect_conditions(first, calibration.conditions, calibration.readouts)
-    settings = {"burst_threshold": calibration.burst_threshold, **settings}
-    if calibration.adaptive:
-        settings["adaptive_from"] = calibration.adjusted
-    delivered, unknown = calibration.delivered(culture)
-    if "pulse" in settings:
-        unknown = ()
-    settings = delivered | settings
-    # The recording's conditions have their stimuli: older policies do not know those of patterns.
-    settings["conditions"] = calibration.conditions
-    if first.neural_observation:
-        settings["remembering"] = calibration.remembering
-    loop, findings = Loop.of_policy(first, calibration.percentiles, pulses=pulses, **settings)
+    loop, findings = _loop_of(first, culture, calibration, pulses, settings)
     age_min, starts = calibration.age_min(culture), _starts(loop.robot, seed, episodes)
-    if calibration.recording is not None:
-        unknown += differences(calibration.recording, culture, patterns_too=loop.encoder.takes_patterns)
     called = [name for name, agent in (agents or {}).items() if not isinstance(agent, Actor)]
-    findings = unknown + findings + tuple(_warnings(first, loop, calibration, age_min, starts, called))
+    findings += tuple(_warnings(first, loop, calibration, age_min, starts, called))
     account = account or Account()
     animat = Animat(loop.robot, loop.mapping, len(loop.conditions))
     environment: Environment[Any] = NeuralObservation(animat) if first.neural_observation else animat
     simulator = calibration.simulator
     networks = networks_of(list(policies.values()), greedy=greedy)
     trained, controls = Control("policies", "as trained", networks), [RANDOM]
-    lacks = lacking(loop.robot)
     if with_controls:
-        if "heuristic" in lacks:
+        if "heuristic" in (lacks := lacking(loop.robot)):
             findings += (Finding("no-heuristic", "note", lacks["heuristic"]),)
         labels = [condition.label for condition in loop.conditions]
         controls = controls_of(environment, simulator, labels, networks)
@@ -149,15 +137,8 @@ def run_policies(
         controls.append(coupling_of(environment, simulator, seed=seed))
     ideal = None
     if with_interventions:
-        if isinstance(loop.robot, HostRobot):
-            raise InvalidArgument(
-                f"--interventions: expected a robot in JAX, got {loop.robot.name}, which is stepped outside JAX"
-            )
-        simulated: dict[str, Any] = {"episodes": INTERVENTION_EPISODES, "seed": seed, "starts": starts}
-        half_way = trained.run(environment, simulator, **simulated).half_way
-        actuator, *changed = interventions_of(environment, simulator, networks, switch_at=half_way)
-        ideal = actuator, actuator.run(environment, simulator, **simulated).returns.ravel()
-        controls += [each for each in changed if each.name not in ("silent", "shuffled")]
+        interventions, ideal = _interventions(trained, networks, environment, simulator, seed, starts)
+        controls += interventions
     own = controls_of_own(agents or {}, environment, simulator, [*policies, *(control.name for control in controls)])
     acting = {name: Greedy(policy) if greedy else policy for name, policy in policies.items()}
     pooled = np.concatenate(calibration.responses_hz)
@@ -167,10 +148,8 @@ def run_policies(
     of_each = planned_episodes(len(policies), len(controls), episodes) + [episodes] * len(own)
     check_session(culture, loop, taking_turns, of_each, seed)
 
-    # The optimal return meanwhile, on another core: a session must not wait for one.
-    thread = ThreadPoolExecutor(1)
-    computed = thread.submit(_optimal_return, animat, calibration, starts)
-    try:
+    # On another core: a session must not wait for the optimal return.
+    with _meanwhile(lambda: _optimal_return(animat, calibration, starts)) as computed:
         predicted = predict(
             trained,
             tuple(policies),
@@ -182,10 +161,6 @@ def run_policies(
             starts=starts,
             progress=in_phase(progress, "predicting"),
         )
-    except Exception:
-        # A program that exits while JAX computes is killed by a signal. A user who interrupts does not wait.
-        thread.shutdown()
-        raise
     optimum, why_none = computed.result()
     plan = [
         (n, predicted[each.name].presented, each.delivery != "silent")
@@ -211,7 +186,7 @@ def run_policies(
         progress=in_phase(progress, "closed loop", sum(of_each), "episodes"),
         predicted={name: of.interval for name, of in predicted.items()},
     )
-    rows = _rows(taking_turns, tuple(policies), predicted, session, loop, first.pulse_cost, starts)
+    rows = rows_of(session, taking_turns, tuple(policies), predicted, loop, first.pulse_cost, starts)
     gap_reasons: tuple[Finding, ...] = ()
     if sign := rows[0].gap_sign:
         responses = read_responses(session, loop, tuple(policies))
@@ -229,11 +204,72 @@ def run_policies(
         reasons=gap_reasons,
         whose_work=() if ideal is None else intervention_table(rows, *ideal),
     )
+    return _written(gap)
+
+
+def _loop_of(
+    first: Policy, culture: Culture, calibration: Calibration, pulses: int | None, settings: dict[str, Any]
+) -> tuple[Loop, tuple[Finding, ...]]:
+    """The loop for the policies, represented by the first, and its differences from the recording and the policies.
+
+    `settings` replace those that the calibration gives.
+    """
+    delivered, unknown = calibration.delivered(culture)
+    if "pulse" in settings:
+        unknown = ()
+    settings = {"burst_threshold": calibration.burst_threshold} | delivered | settings
+    # The recording's conditions have their stimuli: older policies do not know those of patterns.
+    settings["conditions"] = calibration.conditions
+    if calibration.adaptive:
+        settings["adaptive_from"] = calibration.adjusted
+    if first.neural_observation:
+        settings["remembering"] = calibration.remembering
+    loop, unlike_policy = Loop.of_policy(first, calibration.percentiles, pulses=pulses, **settings)
+    if calibration.recording is not None:
+        unknown += differences(calibration.recording, culture, patterns_too=loop.encoder.takes_patterns)
+    return loop, unknown + unlike_policy
+
+
+def _interventions(
+    trained: Control,
+    networks: Networks,
+    environment: Environment[Any],
+    simulator: NeuronSimulator,
+    seed: int,
+    starts: Starts | None,
+) -> tuple[list[Control], tuple[Control, Float64[np.ndarray, " episodes"]]]:
+    """The interventions that a loop can run, and the ideal actuator with its returns on the simulator."""
+    if isinstance(environment.robot, HostRobot):
+        name = environment.robot.name
+        raise InvalidArgument(f"--interventions: expected a robot in JAX, got {name}, which is stepped outside JAX")
+    simulated: dict[str, Any] = {"episodes": INTERVENTION_EPISODES, "seed": seed, "starts": starts}
+    half_way = trained.run(environment, simulator, **simulated).half_way
+    actuator, *changed = interventions_of(environment, simulator, networks, switch_at=half_way)
+    returns = actuator.run(environment, simulator, **simulated).returns.ravel()
+    # The other two are controls already.
+    return [each for each in changed if each.name not in ("silent", "shuffled")], (actuator, returns)
+
+
+@contextmanager
+def _meanwhile(compute: Callable[[], T]) -> Iterator[Future[T]]:
+    """Compute in another thread while the block runs."""
+    thread = ThreadPoolExecutor(1)
+    computed = thread.submit(compute)
+    try:
+        yield computed
+    except Exception:
+        # A program that exits while JAX computes is killed by a signal. A user who interrupts does not wait.
+        thread.shutdown()
+        raise
+
+
+def _written(gap: RealityGap) -> RealityGap:
+    """Write the table; if that fails, the session's ending says so, and the table can still be printed."""
     try:
         gap.write()
     except InvalidFile as error:
-        # It can still be printed.
-        ending = replace(session.ending, message=f"{session.ending.message}; {error}")
+        session, ending = gap.session, gap.session.ending
+        ending = replace(ending, message=f"{ending.message}; {error}")
         return replace(gap, session=replace(session, ending=ending))
     return gap
 
@@ -314,65 +350,3 @@ def check_policies(policies: Mapping[str, Policy]) -> Policy:
     if first.mapping is None:
         raise UnusableData("policies: expected some that act through neurons, got some that were trained without")
     return max(policies.values(), key=lambda policy: policy.trained_until_min(0.0) or 0.0)
-
-
-def _rows(
-    agents: Sequence[Agent],
-    names: tuple[str, ...],
-    predicted: Mapping[str, Prediction],
-    session: Session,
-    loop: Loop,
-    pulse_cost: float,
-    starts: Starts | None,
-) -> tuple[Row, ...]:
-    goal_outcomes, of_trials = outcomes(loop.robot, session), electrode_pulses(loop.conditions, loop.pulses)
-    unstimulated = {agent.name for agent in agents if agent.delivery == "silent"}
-    of_agents = {agent.name: [each.number for each in session.episodes if each.agent == agent.name] for agent in agents}
-    is_drawn = starts is not None or len({episode.start for episode in session.episodes}) > 1
-    turn_of = {number: turn for numbers in of_agents.values() for turn, number in enumerate(numbers)}
-
-    def row(name: str, meaning: str, of: Sequence[str]) -> Row:
-        episodes = [episode for episode in session.episodes if episode.agent in of]
-        whole = [each for each in episodes if each.is_whole]
-        actions = max(1, sum(each.iterations for each in episodes))
-        trials = max(1, sum(each.trials for each in episodes))
-        every = pooled = pool([predicted[each] for each in of])
-        turn = expected = None
-        if is_drawn:
-            turn = np.array([turn_of[each.number] for each in whole], np.int64)
-            if whole and starts is not None:
-                pooled = pool([predicted[each.agent].of_start(turn_of[each.number]) for each in whole])
-                expected = pooled.returns.reshape(len(whole), -1).mean(axis=1)
-        met = [goal_outcomes[episode.number] for episode in episodes if episode.number in goal_outcomes]
-        return Row(
-            name=name,
-            meaning=meaning,
-            predicted=pooled.returns.ravel(),
-            bootstrap_means=pooled.bootstrap_means.mean(axis=1),
-            measured=np.array([episode.total for episode in whole], np.float64),
-            pulses_per_action=sum(each.pulses - each.warm_up_pulses for each in episodes) / actions,
-            electrode_pulses=sum(each.electrode_pulses for each in whole) / len(whole) if whole else math.nan,
-            predicted_electrode_pulses=None
-            if of_trials is None
-            else float(every.presented @ of_trials) * (name not in unstimulated),
-            pulse_cost=pulse_cost,
-            bursts=sum(each.bursts for each in episodes) / trials,
-            late=sum(each.late for each in episodes) / trials,
-            met=Outcome(*map(np.stack, zip(*met, strict=True))).means() if met else {},  # type: ignore[arg-type]
-            within=loop.robot.return_range,
-            turn=turn,
-            expected=expected,
-            from_all_starts=float(every.returns.mean()),
-        )
-
-    policies = row("policies" if len(names) > 1 else names[0], "as trained", names)
-    rows = [policies]
-    # The policies come first; a single one has its row already.
-    for agent in agents if len(names) > 1 else agents[1:]:
-        own = row(agent.name, agent.meaning, [agent.name])
-        # With a different goal in mid-episode policies should do equally well: there is nothing to outperform.
-        is_compared = agent.name not in names and agent.switch_at is None
-        if is_compared and len(own.measured) and len(policies.measured):
-            own = replace(own, comparison=compare_episodes(policies.measured, own.measured))
-        rows.append(own)
-    return tuple(rows)
