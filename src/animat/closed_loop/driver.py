@@ -26,6 +26,7 @@ from animat.coding.encoder import Dealer
 from animat.cultures.base import Culture
 from animat.cultures.budget import Account
 from animat.cultures.failures import describe_error
+from animat.cultures.observed import Observed
 from animat.errors import AnimatError, BudgetSpent
 from animat.evaluation.own_agents import Controller, begun
 from animat.neurons.history_tracker import HistoryState
@@ -178,33 +179,23 @@ class Driver:
         frequency_hz = self._dealer.frequency_hz(delivered)
         due_s = self._last_pulse_s + 1 / frequency_hz
         since_s, times_s = self._times(due_s, frequency_hz)
-        stimuli: list[Stimulus] = []
-        if agent.delivery != "silent" or is_warm_up:
-            stimuli = [
-                Stimulus(float(t), target.electrodes, loop.pulse, frequency_hz, target.pattern, self._n_presented)
-                for t, target in zip(times_s, self._dealer.targets(delivered), strict=True)
-            ]
+        is_stimulated = agent.delivery != "silent" or is_warm_up
+        stimuli = self._stimuli(delivered, times_s, frequency_hz) if is_stimulated else []
         # Two samples longer than the window, so that a spike at its very end is not left to the next stretch.
         duration_s = float(times_s[-1]) + loop.window_ms[1] * 1e-3 + 2 / self._rate_hz
         decided_s = self.clock.now_s() - self._data_at_s
         stretch = self._observe(stimuli, duration_s, since_s)
         pulse_time_s = stretch.stimulus_time_s if stimuli else self._on_samples(since_s - self._zero_s + times_s)
         after_s = pulse_time_s[-1:]
-        # Lateness of the real times; where nothing is delivered, no pulse is late.
-        due_at_s = due_s - self._zero_s + np.arange(loop.pulses) / frequency_hz
-        given = [i for i, stimulus in enumerate(stimuli) if not stimulus.is_rest]
-        late_s = float(np.max((pulse_time_s - due_at_s)[given], initial=0.0))
-        late_s = late_s if late_s > self._least_late_s else 0.0
+        late_s = self._late_s(stimuli, pulse_time_s, due_s, frequency_hz)
         drawn_from = None if is_warm_up else agent.drawn_from
         x_hz, response = read_response(loop, drawn_from, stretch, self._members, after_s, self._rng)
         is_burst = response["is_burst"]
         self._last_pulse_s = self._zero_s + float(after_s[0])
         again = is_burst and loop.on_burst == "repeat" and repeats < loop.most_repeats and not is_warm_up
         came = self._remembered
-        if loop.history is not None and stimuli:
-            is_rested = bool(pulse_time_s[0] - came.at_s > SILENCE_S)
-            came = loop.history.when(came, float(after_s[0]), is_rested=is_rested)
-            self._remembered = loop.history.after(came, delivered, response["rate_hz"], is_burst=is_burst)
+        if stimuli:
+            came = self._remember(delivered, pulse_time_s, response["rate_hz"], is_burst=is_burst)
         tick = Tick(
             number=self._n_presented,
             agent=agent.name,
@@ -240,6 +231,40 @@ class Driver:
             self.records.append(record._replace(fields={**record.fields, "tick": vars(tick), **adapted}))
             self.unfinished = None
         return tick
+
+    def _stimuli(self, condition: int, times_s: Float64[np.ndarray, " pulses"], frequency_hz: float) -> list[Stimulus]:
+        """The stimuli of a trial, on the next patterns of the deck."""
+        return [
+            Stimulus(float(t), target.electrodes, self.loop.pulse, frequency_hz, target.pattern, self._n_presented)
+            for t, target in zip(times_s, self._dealer.targets(condition), strict=True)
+        ]
+
+    def _late_s(
+        self,
+        stimuli: Sequence[Stimulus],
+        pulse_time_s: Float64[np.ndarray, " pulses"],
+        due_s: float,
+        frequency_hz: float,
+    ) -> float:
+        """How late the latest pulse of a trial came, whose first one was due at `due_s`; 0 within rounding.
+
+        Where nothing is delivered, no pulse is late.
+        """
+        due_at_s = due_s - self._zero_s + np.arange(self.loop.pulses) / frequency_hz
+        given = [i for i, stimulus in enumerate(stimuli) if not stimulus.is_rest]
+        late_s = float(np.max((pulse_time_s - due_at_s)[given], initial=0.0))
+        return late_s if late_s > self._least_late_s else 0.0
+
+    def _remember(
+        self, condition: int, pulse_time_s: Float64[np.ndarray, " pulses"], rate_hz: Any, *, is_burst: bool
+    ) -> HistoryState:
+        """Update the history state by a response; returns the state when the pulse came."""
+        came, history = self._remembered, self.loop.history
+        if history is not None:
+            is_rested = bool(pulse_time_s[0] - came.at_s > SILENCE_S)
+            came = history.when(came, float(pulse_time_s[-1]), is_rested=is_rested)
+            self._remembered = history.after(came, condition, rate_hz, is_burst=is_burst)
+        return came
 
     def _move(
         self, agent: Agent, x_hz: Float64[np.ndarray, "*readouts"], is_burst: bool, iteration: int
@@ -285,29 +310,9 @@ class Driver:
             raise Stop(Ending("person", "stopped by a person"))
         if stopped := self.stopped_by_file():
             raise Stop(stopped)
-        culture, account = self.culture, self.account
-        try:
-            account.check(stimuli)
-        except BudgetSpent as spent:
-            raise Stop(Ending("budget", str(spent))) from spent
         number = self._n_stretches
         request = request_fields(number, since_s - self._zero_s, stimuli)
-        self._n_stretches += 1
-        # Spent before the answer: unanswered pulses may have been delivered.
-        account.spend(stimuli)
-        self.request = request
-        self._set_deadline("the culture", duration_s)
-        try:
-            observed = culture.deliver(stimuli, duration_s, since_s=since_s)
-        except Exception as error:
-            # The error says so, not the culture's own count, which may include another thread's stimuli.
-            is_admitted = not isinstance(error, AnimatError) or error.is_admitted
-            if not is_admitted:
-                account.take_back(stimuli)
-            # If a person stopped the culture, that ended the session, not the refusal that follows.
-            ending = ending_of(error, culture, self.is_stopped)
-            self._log_fault(ending, request, is_admitted=is_admitted)
-            raise Stop(ending) from error
+        observed = self._delivered(stimuli, duration_s, since_s, request)
         fault = check_answer(
             observed,
             requested_s=np.array([stimulus.time_s for stimulus in stimuli], np.float64),
@@ -334,6 +339,32 @@ class Driver:
             self.clock.sleep_until(until_s)
         self._data_at_s = self.clock.now_s()
         return stretch
+
+    def _delivered(
+        self, stimuli: Sequence[Stimulus], duration_s: float, since_s: float, request: dict[str, Any]
+    ) -> Observed:
+        """What the culture answers, within the budget; if it fails, this is logged, and the loop ends."""
+        culture, account = self.culture, self.account
+        try:
+            account.check(stimuli)
+        except BudgetSpent as spent:
+            raise Stop(Ending("budget", str(spent))) from spent
+        self._n_stretches += 1
+        # Spent before the answer: unanswered pulses may have been delivered.
+        account.spend(stimuli)
+        self.request = request
+        self._set_deadline("the culture", duration_s)
+        try:
+            return culture.deliver(stimuli, duration_s, since_s=since_s)
+        except Exception as error:
+            # The error says so, not the culture's own count, which may include another thread's stimuli.
+            is_admitted = not isinstance(error, AnimatError) or error.is_admitted
+            if not is_admitted:
+                account.take_back(stimuli)
+            # If a person stopped the culture, that ended the session, not the refusal that follows.
+            ending = ending_of(error, culture, self.is_stopped)
+            self._log_fault(ending, request, is_admitted=is_admitted)
+            raise Stop(ending) from error
 
     def _log_fault(self, ending: Ending, request: dict[str, Any], **more: Any) -> None:
         """Log a request that has no usable answer."""

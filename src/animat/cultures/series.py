@@ -122,11 +122,8 @@ def record_series(
             zero_s = _start_s(made, culture, protocol, interval_s)
         clear_leftovers(folder, "recording_*_min.nwb", STATE_FILE, SELECTION_FILE)
         follow = opened.enter_context(PartialRecording(folder, culture.device is not None))
-        if virtual is not None and not (recorded and (folder / SELECTION_FILE).exists()):
-            virtual.selection.save(folder / SELECTION_FILE)
-        if virtual is not None and not recorded:
-            # A run killed during the first recording needs no second scan.
-            virtual.save_state(folder / STATE_FILE, sessions=0)
+        if virtual is not None:
+            _save_beginning(virtual, folder, recorded)
         for session, file in enumerate(files[recorded:], recorded):
             due_s = zero_s + session * interval_s
             if (virtual is None and file.exists()) or culture.now_s >= due_s + interval_s:
@@ -136,13 +133,7 @@ def record_series(
             expect_writable(folder, room_bytes=room_bytes)
             part = Part(progress, session, 1, sessions, file.name)
             recording = culture.record(protocol, order_seed(seed, session), part, follow)
-            if not file.exists():
-                follow.finish(recording, partial(write_nwb, recording, file))
-            elif not read_recording(file).equals(recording):
-                remedy = "remove it, or choose another folder"
-                raise Mismatch(f"{file}: expected the same as when recorded again, got another recording: {remedy}")
-            else:
-                follow.remove()
+            _keep(recording, file, follow)
             if virtual is not None:
                 # After the recording, so that the state is never ahead of a missing recording.
                 virtual.save_state(folder / STATE_FILE, sessions=session + 1)
@@ -150,6 +141,25 @@ def record_series(
     existing = [file for file in files if file.exists()]
     progress.update(sessions, sessions, existing[-1].name if existing else "")
     return Series(existing, [session * interval_min for session, file in enumerate(files) if not file.exists()])
+
+
+def _save_beginning(culture: VirtualCulture, folder: Path, recorded: int) -> None:
+    """Save the electrodes and, before any recording, the state: a run killed during the first needs no second scan."""
+    if not (recorded and (folder / SELECTION_FILE).exists()):
+        culture.selection.save(folder / SELECTION_FILE)
+    if not recorded:
+        culture.save_state(folder / STATE_FILE, sessions=0)
+
+
+def _keep(recording: Recording, file: Path, follow: PartialRecording) -> None:
+    """Write a recording, or compare it with the file if it was recorded again."""
+    if not file.exists():
+        follow.finish(recording, partial(write_nwb, recording, file))
+    elif not read_recording(file).equals(recording):
+        remedy = "remove it, or choose another folder"
+        raise Mismatch(f"{file}: expected the same as when recorded again, got another recording: {remedy}")
+    else:
+        follow.remove()
 
 
 def order_seed(seed: int, session: int) -> int:
