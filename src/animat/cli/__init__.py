@@ -257,24 +257,31 @@ def _parse(arguments: list[str]) -> Command:
         for option, value in itertools.pairwise([*arguments, "--"]):
             if value.startswith("--") and not isinstance(options.get(option.replace("_", "-"), False), bool):
                 raise InvalidArgument(f"{option}: expected a value after it, got none{see}") from None
-        # A box with a title; on terminals without these characters, lines of dashes, one of them under the title.
-        lines = [line.strip("│╭╮╰╯ ") for line in output.getvalue().splitlines()[1:]]
-        parts = itertools.groupby(lines, lambda line: bool(line) and not line.strip("─-"))
-        message = next(" ".join(line for line in part if line) for is_rule, part in parts if not is_rule)
-        message = message.removeprefix("Error parsing ")
-        if message.startswith("Missing from "):
-            message = f"{message.partition(': ')[2].split()[0]}: expected a value, got none"
-        if message.startswith("Missing value for argument '"):
-            _, option, expected = message.split("'")
-            dash = f"a value after it, got one that begins with a dash: write {option}=VALUE"
-            message = f"{option}: expected {'two numbers, got one' if ' 2 ' in expected else dash}"
-        if message.startswith("{") or message.partition(":")[0].isupper():
-            # The choices or the kind of a positional argument, in place of its name.
-            named = next(field.name for field in fields if "Positional" in str(field.type))
-            message = f"{named}: {message.partition(': ')[2]}"
-        raise InvalidArgument(f"{message}{see}") from None
+        raise InvalidArgument(f"{_in_one_line(output.getvalue(), fields)}{see}") from None
     _expect_known(unknown, options, see)
     return command
+
+
+def _in_one_line(box: str, fields: Sequence[dataclasses.Field[Any]]) -> str:
+    """Tyro's error in our words; `fields` are those of the command.
+
+    It is in a box with a title; on terminals without these characters, in lines of dashes, one of them under the title.
+    """
+    lines = [line.strip("│╭╮╰╯ ") for line in box.splitlines()[1:]]
+    parts = itertools.groupby(lines, lambda line: bool(line) and not line.strip("─-"))
+    message = next(" ".join(line for line in part if line) for is_rule, part in parts if not is_rule)
+    message = message.removeprefix("Error parsing ")
+    if message.startswith("Missing from "):
+        message = f"{message.partition(': ')[2].split()[0]}: expected a value, got none"
+    if message.startswith("Missing value for argument '"):
+        _, option, expected = message.split("'")
+        dash = f"a value after it, got one that begins with a dash: write {option}=VALUE"
+        message = f"{option}: expected {'two numbers, got one' if ' 2 ' in expected else dash}"
+    if message.startswith("{") or message.partition(":")[0].isupper():
+        # The choices or the kind of a positional argument, in place of its name.
+        named = next(field.name for field in fields if "Positional" in str(field.type))
+        message = f"{named}: {message.partition(': ')[2]}"
+    return message
 
 
 def _plain(option: str) -> str:
