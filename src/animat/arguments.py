@@ -80,7 +80,7 @@ def checked_arguments(thing: Thing) -> Thing:
         try:
             given = signature.bind(*args, **kwargs).arguments
         except TypeError:
-            return function(*args, **kwargs)  # Python says what is missing or too much.
+            return function(*args, **kwargs)  # Raises Python's own error for missing or unexpected arguments.
         for name in names:
             if name in given:
                 check_argument(name, given[name], _hints(function).get(name, Any))
@@ -120,7 +120,7 @@ def _strangers(value: Any, hint: Any) -> list[Any]:
         fits = False
     elif inner and issubclass(kind, Iterable):
         fits = isinstance(value, Iterable) and not isinstance(value, str | bytes | Mapping)
-        # What can be read only once is left to the function.
+        # The items of an iterator cannot be checked without consuming it.
         if fits and isinstance(value, Collection):
             return [stranger for each in value for stranger in _strangers(each, inner[0])]
     else:

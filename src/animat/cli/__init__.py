@@ -91,7 +91,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             # Here, where errors can be caught, not while Python exits: help ends with SystemExit.
             sys.stdout.flush()
     except KeyboardInterrupt:
-        # Before the command began.
+        # Ctrl-C while the command was being loaded.
         print("animat: interrupted", file=sys.stderr)
         return 130
     except OSError as error:
@@ -119,7 +119,7 @@ def _run(arguments: list[str]) -> int:
     try:
         Path.cwd()
     except OSError as error:
-        # Libraries ask for it, and what they cannot do without it would be blamed on a recording.
+        # Libraries need it, and their errors would be taken for those of a recording.
         got = f"expected one, got none ({error.strerror}): cd to one that exists"
         print(f"animat: working folder: {got}", file=sys.stderr)
         return 1
@@ -295,7 +295,7 @@ def _expect_known(unknown: Sequence[str], options: Mapping[str, Any], see: str) 
         if option in options:
             raise InvalidArgument(f"{option[2:]}: expected only its value, got {argument} before it{see}") from None
         if argument.startswith("-"):
-            # As in the commands that stimulate a culture besides; only `record` has sessions.
+            # Other commands have --culture-seed; `record`, which alone has --sessions, has --seed.
             is_meant = option == "--culture-seed" and "--sessions" in options
             hint = "; did you mean --seed?" if is_meant else did_you_mean(option, options) or see
             raise InvalidArgument(f"unknown option {argument}{hint}") from None
@@ -344,7 +344,7 @@ def _option(option: constructors.StructFieldSpec) -> constructors.StructFieldSpe
             raise ValueError(f"expected {expected}, got {' '.join(map(repr, words))}")
 
         if expected is not None:
-            # Two numbers that may be left out would be in braces, as choices are.
+            # Without the braces in which tyro shows two optional numbers, as if they were choices.
             metavar = spec.metavar if spec.choices else spec.metavar.strip("{}")
             kind = Annotated[kind, dataclasses.replace(spec, instance_from_str=read, choices=None, metavar=metavar)]
     # Flags are off unless given.

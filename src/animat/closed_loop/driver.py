@@ -75,7 +75,7 @@ class Driver:
         self._channels, self._rate_hz = culture.channels, culture.sampling_rate_hz
         # A device keeps its own time, from which the machine's clock drifts away.
         self._is_held_back = loop.real_time and culture.device is None
-        # The grid and the rounding to samples move a pulse by half a step each.
+        # Not late within rounding: the grid of ticks and that of samples each move a pulse by up to half a step.
         self._least_late_s = max(TICK_S, (TICK_S + 1 / self._rate_hz) / 2) + 1e-9
         self._adaptive = None if loop.adaptive_from is None else AdaptiveThresholds(loop.adaptive_from)
         self._percentiles = loop.percentiles
@@ -357,7 +357,7 @@ class Driver:
         try:
             return culture.deliver(stimuli, duration_s, since_s=since_s)
         except Exception as error:
-            # The error says so, not the culture's own count, which may include another thread's stimuli.
+            # By the error itself: the culture's count may include another thread's stimuli.
             is_admitted = not isinstance(error, AnimatError) or error.is_admitted
             if not is_admitted:
                 account.take_back(stimuli)
@@ -377,7 +377,7 @@ class Driver:
         try:
             return ask()
         except BaseException as error:
-            # Libraries exit, and raise what Ctrl-C and cancelled tasks do, too.
+            # Also SystemExit, KeyboardInterrupt and CancelledError, which a user's code or its libraries may raise.
             raise Stop(Ending(by, f"{who} raised {describe_error(error)}")) from error
 
     def _set_deadline(self, who: str, in_s: float = 0.0) -> None:

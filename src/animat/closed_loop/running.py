@@ -242,7 +242,7 @@ class _Supervisor:
             message = f"{ending.message}; BUT {self._not_halted}: make sure that the device delivers no more pulses"
             ending = replace(ending, message=message)
         left_out: dict[str, int] = {}
-        # A culture that is gone may not be able to count.
+        # A culture that has lost its device may fail here.
         with suppress(Exception):
             left_out = Counter(self._culture.left_out) - Counter(self._left_out)
         try:
@@ -271,7 +271,7 @@ class _Supervisor:
     def _stopped(self) -> Ending | None:
         """The ending if a person stopped the loop some time ago, and an agent or the robot keeps it from ending."""
         since_s, ending = self._by_person or (math.inf, None)
-        # What the culture answers to the last pulses is waited for.
+        # The culture's answer to the last pulses is waited for; only the robot and agents are not.
         is_theirs = self._driver.deadline[1] not in ("the culture", "the clock")
         return ending if is_theirs and time.monotonic() > since_s + _UNANSWERED_S else None
 

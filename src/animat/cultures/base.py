@@ -155,7 +155,7 @@ class Culture(Openable):
                     observed = self._deliver(admitted, duration_s)
                 except BaseException:
                     if isinstance(self, ComputedCulture):
-                        # What was to come does not come; a device may still deliver it.
+                        # A computed culture delivers nothing more; a device may still deliver the rest.
                         guard.interrupt(self.now_s)
                     raise
                 return with_rests(observed, stimuli, now_s)
@@ -244,7 +244,7 @@ class Culture(Openable):
         """
         schedule, progress = self.schedule(protocol, seed), progress or Silent()
         provenance = {**self.provenance, "protocol_seed": str(seed)}
-        # Other recordings are the same whenever they are made.
+        # Recordings of computed cultures have no date, as they do not depend on when they are made.
         date = None if self.device is None else datetime.now(UTC).replace(microsecond=0)
         if date is not None:
             provenance["recorded_at"] = date.isoformat()

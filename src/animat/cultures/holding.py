@@ -32,7 +32,7 @@ def hold(device: Path, holder: str) -> Iterator[bool]:
     """Hold a device exclusively until the block or the process ends; yields whether another `holder` had it last."""
     with ExitStack() as stack:
         try:
-            # In a world-writable folder another user could point a link at one of ours.
+            # Refused, as the parent is world-writable: another user could have made it a link to one of our folders.
             if device.is_symlink() or (device.exists() and not device.is_dir()):
                 raise DeviceFailed(f"{device.name}: expected a folder as its lock, got another file: remove {device}")
             stack.enter_context(exclusive_lock(device))

@@ -65,7 +65,7 @@ class History:
     """
 
     def __init__(self) -> None:
-        # On each electrode, and on any of them as None.
+        # Of pulses on each electrode; the key None has those of all electrodes.
         self._starts_on: dict[int | None, list[int]] = defaultdict(list)
         self._seen_ns = 0
         self.busy_until_ns = -(2**63)

@@ -247,7 +247,7 @@ class _Tables:
             low, high = float(of_layer.min()), float(of_layer.max())
             step = max(high - low, 1e-6) / 65535
             self._low[remaining, layer], self._step[remaining, layer] = low, step
-            # Adding a half and truncating rounds, with one pass less.
+            # Truncation after adding a half rounds, in one pass less than `np.rint`.
             self._kept[remaining, layer] = (of_layer - np.float32(low)) * np.float32(1 / step) + np.float32(0.5)
 
     def values(self, remaining: int, layers: slice) -> Float32[np.ndarray, "rows layers nodes"]:

@@ -113,7 +113,7 @@ class Called(Actor):
         thread.start()
         try:
             while thread.is_alive():
-                # Without a time it would not look for Ctrl-C that another thread received.
+                # With a timeout, as a plain join would not notice a Ctrl-C that another thread received.
                 thread.join(0.1)
             return result.result()
         except BaseException as error:
@@ -214,7 +214,7 @@ def _try(name: str, actor: Actor, environment: Environment[Any], simulator: Neur
         raise InvalidArgument(f"agents: {name}: {expected}, got the shapes {', '.join(map(str, parts))}")
     try:
         if isinstance(environment.robot, HostRobot):
-            # Its indices are checked in its episodes, step by step.
+            # Whether an index is in range is checked later, in each step of its episodes.
             _expect_integers(actor, environment)
             return
         found = np.unique(trace(environment, simulator, actor, episodes=8, seed=1).actions).tolist()

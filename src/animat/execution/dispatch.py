@@ -329,7 +329,7 @@ class Dispatch:
 
 def _cancel(call: Call) -> None:
     if not call.future.done() and call.future.cancel():
-        # Only this wakes those who wait for it.
+        # Needed to wake those who wait for the future.
         call.future.set_running_or_notify_cancel()
 
 

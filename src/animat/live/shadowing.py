@@ -126,7 +126,7 @@ def live(
         policies = run.shadow(progress)
         first, at_min = next(iter(policies.values())), run.used[-1].start_min
         calibration = Calibration.of_series(run.used, first, at_min=at_min, adaptive=adaptive, kind=kind)
-        # Its own lock, by which viewers know that it is running.
+        # The session has its own lock, by which viewers see that it is running.
         with exclusive_lock(run.folder / SESSION):
             gap = run_policies(
                 policies,
@@ -297,7 +297,7 @@ class _Run:
                 self.write("training began", **swap)
 
     def write(self, what: str, **fields: Any) -> dict[str, Any]:
-        # Its last known time if the connection is lost.
+        # If the connection is lost, the last known time is logged.
         with suppress(Exception):
             self._known_s = self.culture.now_s
         at, wall_s = datetime.now(UTC).isoformat(timespec="milliseconds"), time.monotonic() - self._wall_zero_s

@@ -188,13 +188,13 @@ def share_below(
     Source: the non-randomised transform of Czado, Gneiting and Held 2009, doi:10.1111/j.1541-0420.2009.01191.x.
     """
     low, high = transforms.T
-    # The difference below would not be exact for those that are hardly spread.
+    # Those with hardly any spread count as points: the difference below would not be exact.
     is_spread = high - low > 1e-6
     low, high, points = low[is_spread], high[is_spread], np.sort(low[~is_spread])
     density = 1 / (high - low)
-    # A share that rises from F(x-) to F(x) is the difference of two that rise from there on for ever.
+    # A ramp from F(x-) to F(x) is the difference of two endless ramps that begin there.
     rising = _rising(low, density, at) - _rising(high, density, at)
-    # 1e-12: shares are rounded, and what is at a place is not below it.
+    # 1e-12: a point at a place is not below it, but shares are rounded.
     return np.asarray((rising + np.searchsorted(points, at - 1e-12)) / len(transforms))
 
 

@@ -92,7 +92,7 @@ def _limit(path: Path) -> None:
     used = resource.getrusage(resource.RUSAGE_SELF)
     seconds = used.ru_utime + used.ru_stime + PROCESSOR_S + PROCESSOR_S_PER_MB * size / 1e6
     limits = {resource.RLIMIT_CPU: math.ceil(seconds)}
-    with suppress(FileNotFoundError):  # Only Linux tells, and limits, the memory in use.
+    with suppress(FileNotFoundError):  # Only Linux reports and limits the memory in use.
         in_use = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
         limits[resource.RLIMIT_AS] = in_use + MEMORY_BYTES + MEMORY_PER_BYTE * size
     for kind, limit in limits.items():

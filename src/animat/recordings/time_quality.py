@@ -130,7 +130,7 @@ def _sooner_than_stated(stimuli: Stimuli) -> Iterator[Finding]:
         sooner.append(min(((float(np.median(m)), hz) for hz, m in enough.items()), default=(1.0, 0.0)))
         if _is_regular(enough):
             regular.append(sooner[-1])
-    # If intervals are regular counted in one of the two ways only, this is how frequencies are stated.
+    # If intervals are regular in only one of the two ways of counting, frequencies are stated in that way.
     least, stated_hz = max(sooner) if len(regular) != 1 else regular[0]
     if least > 1 / APART:
         return

@@ -91,7 +91,7 @@ def extract_responses(
     if isinstance(source, ResponseTable):
         window_ms, assumed = _window_of(source, by, window_ms)
     else:
-        # An end that equals the time of the last stimulus or spike is rounded as that is.
+        # 1e-9: the end of the recording may be the rounded time of its last stimulus or spike.
         inside = stimuli.time_s + window_ms[1] * 1e-3 <= _observed_until_s(source, begins) + 1e-9
     # Trials without a condition are read too, as the history of others.
     is_read = stimuli.is_last_of_presentation
@@ -100,8 +100,8 @@ def extract_responses(
     condition = assignment.condition[presented]
     chosen = condition != NO_CONDITION
     bursts = separate_bursts(active_ratio[chosen], burst_threshold, n_channels=n_channels)
-    # There is no silence within a trial, however long it lasts. Rows without times are taken as successive, and nothing
-    # is known about what came before the first.
+    # Silence is measured between pulses: a trial of several, however long, has none. Rows without times are taken as
+    # successive, and nothing is known about what came before the first.
     has_times = isinstance(source, Recording) or source.has_times
     since_s = np.diff(stimuli.time_s, prepend=-np.inf) + begins * setup_s
     silences = np.cumsum(since_s > SILENCE_S)

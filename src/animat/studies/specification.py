@@ -164,7 +164,7 @@ class Arm:
 
     def __post_init__(self) -> None:
         if not self.through_neurons:
-            # Both have their defaults: arms that differ in nothing else share controls and an optimum.
+            # Neither has an effect without neurons: with defaults, such arms share controls and an optimum.
             object.__setattr__(self, "delivery", "chosen")
             object.__setattr__(self, "percentiles", "moving")
             return

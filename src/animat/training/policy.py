@@ -118,7 +118,7 @@ class Policy:
         if self.assessments.ndim != 2 or self.assessments.shape[1] != 5 or self.assessments.dtype.kind != "f":
             raise InvalidArgument(f"assessments: expected rows of five, got shape {self.assessments.shape}")
         expect_provenance(self.provenance)
-        # As in recordings: a policy that was checked stays what it is.
+        # Read-only, so that a checked policy cannot be changed.
         for name in ("weights", "biases"):
             vars(self)[name] = tuple(map(read_only_copy, getattr(self, name)))
         for name in ("scales", "learning_curve", "assessments"):
@@ -197,7 +197,7 @@ class Policy:
         if not trained:
             return None
         if swaps := self.provenance.get("swaps"):
-            # Live training may have been interrupted, and takes newer recordings as they come.
+            # In live training the recordings in use are known only from the swaps, also if it was interrupted.
             return max(first_min, float(swaps[-1]["recorded_at_min"]))
         if not trained.get("shadowing") or trained.get("duration_min") is None:
             return first_min
@@ -209,7 +209,7 @@ class Policy:
         Raises InvalidArgument for one of the wrong shape, or with NaN or infinity, which would pass for an action.
         """
         shape = self.scales.shape
-        # An array's attribute comes first, as reading it takes only a hundredth of a decision's time.
+        # The attribute is read first: `np.shape` takes much longer, at every decision.
         if getattr(observation, "shape", None) != shape and np.shape(observation) != shape:
             got, name = np.shape(observation), self.robot.name
             raise InvalidArgument(f"observation: expected one of {name}, shape {shape}, got shape {got}")

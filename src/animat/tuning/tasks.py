@@ -67,7 +67,7 @@ def programs(environment: Environment[Any], algorithm: SAC) -> tuple[Callable[..
         return learner._replace(trained=learner.trained._replace(log_alpha=jnp.log(numbers["initial_alpha"])))
 
     def chunk(numbers: Numbers, learner: Learner, simulator: NeuronSimulator | None, first: Array, last: Array) -> Any:
-        # Traced numbers bypass the record's checks.
+        # Bypasses the record's checks, which would fail for traced numbers.
         settings = object.__new__(SAC)
         vars(settings).update({**vars(algorithm), **numbers})
         return train_chunk(environment, settings, learner, simulator, first, last)
@@ -166,7 +166,7 @@ class TrainTrials(StudyTask):
 
         environment = training.environment_on(timeline)
         simulator = _at(judging, training.minute(CHUNKS - 1))
-        # Otherwise the first policies of two groups would meet the same episodes.
+        # A different seed for each group: else the first policies of two groups would have the same episodes.
         seed = self.seeds[1] + self.members[0]
         files = []
         for i, trial in enumerate(self.trials):

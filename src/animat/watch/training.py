@@ -137,7 +137,7 @@ def _in_use(training: dict[str, Any], minutes: list[float], share: float) -> lis
         return [("recordings", f"{recordings}; each episode draws one")]
     clock_min = minutes[0]
     if training.get("shadowing"):
-        # At the start of the current chunk.
+        # Simulators change only at the start of a chunk.
         clock_min += (training.get("duration_min") or 0.0) * min(int(_CHUNKS * share), _CHUNKS - 1) / _CHUNKS
     used = max((minute for minute in minutes if minute <= clock_min + 1e-9), default=minutes[0])
     return [("recordings", recordings), ("in use", f"that of minute {used:g}")]

@@ -203,7 +203,7 @@ class CL1Culture(Culture):
         except BaseException as error:
             outcome = "what had not begun was interrupted"
             try:
-                # The one that is open now: this session may have ended while the delivery hung.
+                # Not the session that delivered, which may have ended while the delivery hung.
                 if (now_open := self._session) is not None:
                     now_open.interrupt()
             except Exception as failed:

@@ -246,7 +246,7 @@ class MaxOneCulture(Culture):
         stream = while_open(self._stream)
         until = stream.frame() + int(np.ceil(duration_s * FRAMES_PER_S))
         stream.wait(until)
-        # What came meanwhile is discarded.
+        # Spikes during the rest are discarded.
         stream.take(until, until)
 
     def _halt(self) -> None:

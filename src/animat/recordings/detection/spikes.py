@@ -209,7 +209,7 @@ def median_noise_uv(voltage_uv: Traces, is_blank: Flags | None = None) -> Levels
     NaN for a channel of which nearly everything is blanked.
     """
     if is_blank is not None and is_blank.any():
-        # A sample counts if no channel is blanked, if there are enough of these.
+        # Use the samples in which no channel is blanked; if these are too few, each channel's own.
         kept, samples = ~is_blank.any(axis=0), voltage_uv.shape[1]
         if np.count_nonzero(kept) < 0.5 * samples:
             rows = [row[~blank] for row, blank in zip(voltage_uv, is_blank, strict=True)]
@@ -237,7 +237,7 @@ def find_negative_peaks(
     the first. A channel of infinite depth has none.
     """
     inner = voltage_uv[:, first:last]
-    # The neighbourhood is checked for these few samples only.
+    # Only samples beyond the threshold, which are few, are compared with their neighbours.
     row, column = np.nonzero(inner < -depth_uv[:, None])
     column = column + first
     before, after = np.maximum(column - 1, 0), np.minimum(column + 1, voltage_uv.shape[1] - 1)

@@ -162,6 +162,6 @@ def _electrodes(table: TextTable, place: int) -> Column:
         except (ValueError, OverflowError) as error:
             expected = "expected whole numbers separated by spaces, of at most 64 bits"
             raise table.wrong(row, f"stimulus_electrodes: {expected}, got {cell[:40]!r}") from error
-    # The file of the stimuli, not that of the spikes.
+    # Errors name the stimulus file, not the spike file that is being read.
     with in_file(table.path):
         return padded(lists)

@@ -102,7 +102,7 @@ def _onset_column(file: Hdf5File, at: str) -> str | None:
     if not len(onset_s) == len(start_s) == len(stop_s):
         return None
     known = np.isfinite(onset_s)
-    # Times since the beginning of the trial, or in ms, lie elsewhere.
+    # Times that count from the trial's start, or are in ms, do not lie within their intervals.
     lies_within = (start_s <= onset_s) & (onset_s <= stop_s)
     return named[0] if np.any(known) and np.all(lies_within[known]) else None
 

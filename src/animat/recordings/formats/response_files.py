@@ -32,7 +32,7 @@ def _is_response_table(table: TextTable) -> bool:
     if names & SPIKE_COLUMNS.keys() or file_name.endswith(("_spikes.csv", "_spikes.csv.gz")):
         return False
     if file_name.endswith(("_responses.csv", "_responses.csv.gz")) and not names & {"time", "time_s"}:
-        # It is meant to be one, whatever it lacks.
+        # By its name it is a response table, even if columns are missing.
         return True
     is_long = "channel" in names and bool(names & set(KINDS))
     return is_long or any(name.startswith(f"{kind}_") for name in names for kind in KINDS)
@@ -101,7 +101,7 @@ def _wide(table: TextTable) -> _Read:
     labels = np.array([_label(table.header[i], kind) for i in places[kind]], dtype=np.str_)
     values = np.column_stack([table.numbers(i, table.header[i], required=True) for i in places[kind]])
     table.used.update(places[kind])
-    # It is known, though nothing needs it.
+    # Mark the trial column as used, so that it is not reported as unknown.
     table.place((TRIAL,))
     return values, kind, labels, np.arange(len(table.rows))
 
