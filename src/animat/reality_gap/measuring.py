@@ -20,7 +20,7 @@ from animat.reality_gap.session_responses import outcomes
 from animat.robots.starts import Starts
 
 
-def rows_of(
+def session_rows(
     session: Session,
     agents: Sequence[Agent],
     names: tuple[str, ...],

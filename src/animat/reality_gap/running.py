@@ -7,8 +7,8 @@ import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import replace
-from typing import Any, TypeVar
+from dataclasses import dataclass, replace
+from typing import Any, Self, TypeVar
 
 import numpy as np
 from jaxtyping import Float64
@@ -34,8 +34,8 @@ from animat.evaluation.rollouts import Actor, Networks, networks_of
 from animat.neurons.simulator import NeuronSimulator
 from animat.progress import Progress, in_phase
 from animat.reality_gap.calibration import Calibration
-from animat.reality_gap.measuring import rows_of
-from animat.reality_gap.outlook import outlook
+from animat.reality_gap.measuring import session_rows
+from animat.reality_gap.outlook import Outlook, outlook
 from animat.reality_gap.predicting import EPISODES, MOST_ON_HOST, few_predicted, pool, predict
 from animat.reality_gap.reasons import Evidence, reasons
 from animat.reality_gap.session_responses import read_responses
@@ -110,53 +110,45 @@ def run_policies(
         Mismatch: if they differ from each other, or from the calibration's conditions.
         UnusableData: for policies without neurons.
     """
-    first = check_policies(policies)
+    representative = check_policies(policies)
     expect_at_least("seed", seed, 0)
     # Before minutes of prediction.
     expect_no_session(folder)
-    transfer.expect_conditions(first, calibration.conditions, calibration.readouts)
-    loop, findings = _loop_of(first, culture, calibration, pulses, settings)
+    transfer.expect_conditions(representative, calibration.conditions, calibration.readouts)
+    loop, findings = _loop_of(representative, culture, calibration, pulses, settings)
     age_min, starts = calibration.age_min(culture), _starts(loop.robot, seed, episodes)
     called = [name for name, agent in (agents or {}).items() if not isinstance(agent, Actor)]
-    findings += tuple(_warnings(first, loop, calibration, age_min, starts, called))
+    findings += tuple(_warnings(representative, loop, calibration, age_min, starts, called))
     account = account or Account()
-    animat = Animat(loop.robot, loop.mapping, len(loop.conditions))
-    environment: Environment[Any] = NeuralObservation(animat) if first.neural_observation else animat
-    simulator = calibration.simulator
-    networks = networks_of(list(policies.values()), greedy=greedy)
-    trained, controls = Control("policies", "as trained", networks), [RANDOM]
+    simulation = _Simulation.of(policies, loop, calibration, greedy=greedy, seed=seed, starts=starts)
+    controls = [RANDOM]
     if with_controls:
         if "heuristic" in (lacks := lacking(loop.robot)):
             findings += (Finding("no-heuristic", "note", lacks["heuristic"]),)
-        labels = [condition.label for condition in loop.conditions]
-        controls = controls_of(environment, simulator, labels, networks)
-        # The heuristic stays last: random numbers depend on the place.
-        controls.sort(key=lambda control: control.name == "heuristic")
+        controls = simulation.controls([condition.label for condition in loop.conditions])
     if with_coupling:
         in_phase(progress, "best coupling").update(0, 1, "searching on the simulator")
-        controls.append(coupling_of(environment, simulator, seed=seed))
+        controls.append(coupling_of(*simulation.within, seed=seed))
     ideal = None
     if with_interventions:
-        interventions, ideal = _interventions(trained, networks, environment, simulator, seed, starts)
+        interventions, ideal = simulation.interventions()
         controls += interventions
-    own = controls_of_own(agents or {}, environment, simulator, [*policies, *(control.name for control in controls)])
+    own = controls_of_own(agents or {}, *simulation.within, [*policies, *(control.name for control in controls)])
     acting = {name: Greedy(policy) if greedy else policy for name, policy in policies.items()}
-    pooled = np.concatenate(calibration.responses_hz)
-    taking_turns = [Agent(name, trained.meaning, controller) for name, controller in acting.items()]
-    taking_turns += [agent_of(control, animat, acting, pooled) for control in (*controls, *own)]
+    taking_turns = simulation.agents(acting, (*controls, *own), calibration)
 
     of_each = planned_episodes(len(policies), len(controls), episodes) + [episodes] * len(own)
     check_session(culture, loop, taking_turns, of_each, seed)
 
     # On another core: a session must not wait for the optimal return.
-    with _meanwhile(lambda: _optimal_return(animat, calibration, starts)) as computed:
+    with _meanwhile(lambda: _optimal_return(simulation.animat, calibration, starts)) as computed:
         predicted = predict(
-            trained,
+            simulation.trained,
             tuple(policies),
             (*controls, *own),
-            environment,
+            simulation.environment,
             # Fixed thresholds stay the same in bootstraps; adaptive ones would adapt to their responses.
-            calibration if calibration.adaptive else calibration.with_percentiles(simulator.percentiles),
+            calibration if calibration.adaptive else calibration.with_percentiles(simulation.simulator.percentiles),
             seed=seed,
             starts=starts,
             progress=in_phase(progress, "predicting"),
@@ -170,10 +162,7 @@ def run_policies(
     findings = (*noticed, *findings, *why_none, *calibration.findings)
     if report is not None:
         # Before the first pulse, so that the operator can still stop.
-        for message in warnings_once(findings):
-            report(f"warning: {message}")
-        report(f"each pulse: {loop.pulse}")
-        report(f"{'warning: ' if expected.budget_min < expected.settling_min else ''}{expected}")
+        _report(report, findings, loop, expected)
     expect_writable(folder, room_bytes=expected.room_bytes)
     session = run_session(
         culture,
@@ -186,7 +175,7 @@ def run_policies(
         progress=in_phase(progress, "closed loop", sum(of_each), "episodes"),
         predicted={name: of.interval for name, of in predicted.items()},
     )
-    rows = rows_of(session, taking_turns, tuple(policies), predicted, loop, first.pulse_cost, starts)
+    rows = session_rows(session, taking_turns, tuple(policies), predicted, loop, representative.pulse_cost, starts)
     gap_reasons: tuple[Finding, ...] = ()
     if sign := rows[0].gap_sign:
         responses = read_responses(session, loop, tuple(policies))
@@ -208,9 +197,9 @@ def run_policies(
 
 
 def _loop_of(
-    first: Policy, culture: Culture, calibration: Calibration, pulses: int | None, settings: dict[str, Any]
+    policy: Policy, culture: Culture, calibration: Calibration, pulses: int | None, settings: dict[str, Any]
 ) -> tuple[Loop, tuple[Finding, ...]]:
-    """The loop for the policies, represented by the first, and its differences from the recording and the policies.
+    """The loop for a policy, and its differences from the recording and from the policy.
 
     `settings` replace those that the calibration gives.
     """
@@ -222,32 +211,71 @@ def _loop_of(
     settings["conditions"] = calibration.conditions
     if calibration.adaptive:
         settings["adaptive_from"] = calibration.adjusted
-    if first.neural_observation:
+    if policy.neural_observation:
         settings["remembering"] = calibration.remembering
-    loop, unlike_policy = Loop.of_policy(first, calibration.percentiles, pulses=pulses, **settings)
+    loop, unlike_policy = Loop.of_policy(policy, calibration.percentiles, pulses=pulses, **settings)
     if calibration.recording is not None:
         unknown += differences(calibration.recording, culture, patterns_too=loop.encoder.takes_patterns)
     return loop, unknown + unlike_policy
 
 
-def _interventions(
-    trained: Control,
-    networks: Networks,
-    environment: Environment[Any],
-    simulator: NeuronSimulator,
-    seed: int,
-    starts: Starts | None,
-) -> tuple[list[Control], tuple[Control, Float64[np.ndarray, " episodes"]]]:
-    """The interventions that a loop can run, and the ideal actuator with its returns on the simulator."""
-    if isinstance(environment.robot, HostRobot):
-        name = environment.robot.name
-        raise InvalidArgument(f"--interventions: expected a robot in JAX, got {name}, which is stepped outside JAX")
-    simulated: dict[str, Any] = {"episodes": INTERVENTION_EPISODES, "seed": seed, "starts": starts}
-    half_way = trained.run(environment, simulator, **simulated).half_way
-    actuator, *changed = interventions_of(environment, simulator, networks, switch_at=half_way)
-    returns = actuator.run(environment, simulator, **simulated).returns.ravel()
-    # The other two are controls already.
-    return [each for each in changed if each.name not in ("silent", "shuffled")], (actuator, returns)
+@dataclass(frozen=True, eq=False)
+class _Simulation:
+    """The trained policies, and the simulator of the calibrating recording, on which controls are prepared."""
+
+    trained: Control
+    networks: Networks
+    animat: Animat[Any]
+    environment: Environment[Any]
+    simulator: NeuronSimulator
+    seed: int
+    starts: Starts | None
+
+    @classmethod
+    def of(
+        cls,
+        policies: Mapping[str, Policy],
+        loop: Loop,
+        calibration: Calibration,
+        *,
+        greedy: bool,
+        seed: int,
+        starts: Starts | None,
+    ) -> Self:
+        animat = Animat(loop.robot, loop.mapping, len(loop.conditions))
+        sees_neurons = next(iter(policies.values())).neural_observation
+        environment: Environment[Any] = NeuralObservation(animat) if sees_neurons else animat
+        networks = networks_of(list(policies.values()), greedy=greedy)
+        trained = Control("policies", "as trained", networks)
+        return cls(trained, networks, animat, environment, calibration.simulator, seed, starts)
+
+    @property
+    def within(self) -> tuple[Environment[Any], NeuronSimulator]:
+        return self.environment, self.simulator
+
+    def controls(self, labels: Sequence[str]) -> list[Control]:
+        """All controls; the heuristic stays last, as random numbers depend on the place."""
+        return sorted(controls_of(*self.within, labels, self.networks), key=lambda control: control.name == "heuristic")
+
+    def interventions(self) -> tuple[list[Control], tuple[Control, Float64[np.ndarray, " episodes"]]]:
+        """The interventions that a loop can run, and the ideal actuator with its returns on the simulator."""
+        if isinstance(robot := self.environment.robot, HostRobot):
+            got = f"{robot.name}, which is stepped outside JAX"
+            raise InvalidArgument(f"--interventions: expected a robot in JAX, got {got}")
+        simulated: dict[str, Any] = {"episodes": INTERVENTION_EPISODES, "seed": self.seed, "starts": self.starts}
+        half_way = self.trained.run(*self.within, **simulated).half_way
+        actuator, *changed = interventions_of(*self.within, self.networks, switch_at=half_way)
+        returns = actuator.run(*self.within, **simulated).returns.ravel()
+        # The other two are controls already.
+        return [each for each in changed if each.name not in ("silent", "shuffled")], (actuator, returns)
+
+    def agents(
+        self, policies: Mapping[str, Controller], controls: Sequence[Control], calibration: Calibration
+    ) -> list[Agent]:
+        """Those that take turns in the loop: the policies, then the controls."""
+        pooled = np.concatenate(calibration.responses_hz)
+        own = [Agent(name, self.trained.meaning, controller) for name, controller in policies.items()]
+        return own + [agent_of(control, self.animat, policies, pooled) for control in controls]
 
 
 @contextmanager
@@ -263,6 +291,13 @@ def _meanwhile(compute: Callable[[], T]) -> Iterator[Future[T]]:
         raise
 
 
+def _report(report: Callable[[str], None], findings: Sequence[Finding], loop: Loop, expected: Outlook) -> None:
+    for message in warnings_once(findings):
+        report(f"warning: {message}")
+    report(f"each pulse: {loop.pulse}")
+    report(f"{'warning: ' if expected.budget_min < expected.settling_min else ''}{expected}")
+
+
 def _written(gap: RealityGap) -> RealityGap:
     """Write the table; if that fails, the session's ending says so, and the table can still be printed."""
     try:
@@ -275,11 +310,11 @@ def _written(gap: RealityGap) -> RealityGap:
 
 
 def _warnings(
-    first: Policy, loop: Loop, calibration: Calibration, age_min: float, starts: Starts | None, called: Sequence[str]
+    policy: Policy, loop: Loop, calibration: Calibration, age_min: float, starts: Starts | None, called: Sequence[str]
 ) -> Iterator[Finding]:
     """Known reasons why the measured return may differ from the prediction."""
-    yield from transfer.other_calibration(first.presentation, calibration.presentation)
-    if first.delivery == "shuffled":
+    yield from transfer.other_calibration(policy.presentation, calibration.presentation)
+    if policy.delivery == "shuffled":
         message = (
             "the policies were trained as a control, with conditions drawn at random whatever they chose; this loop "
             "delivers what they choose"
@@ -292,14 +327,14 @@ def _warnings(
             "measured return may differ from the prediction"
         )
         yield Finding("no-warm-up", "warning", message)
-    if calibration.adaptive and first.percentiles == "first":
+    if calibration.adaptive and policy.percentiles == "first":
         message = (
             "the policies were trained with fixed thresholds, but in this loop thresholds adapt to the culture: use "
             "--thresholds fixed to have them as in training"
         )
         yield Finding("moving-percentiles", "warning", message)
-    yield from transfer.other_simulator(first.fitted, calibration.fitted)
-    yield from transfer.other_culture(first.culture, calibration.culture)
+    yield from transfer.other_simulator(policy.fitted, calibration.fitted)
+    yield from transfer.other_culture(policy.culture, calibration.culture)
     yield from transfer.faster_than_recorded(calibration.recording, loop.conditions)
     yield from transfer.old_calibration(age_min, "this session")
     yield from transfer.no_memory(calibration.findings, calibration.presentation, has_memory=has_memory)
