@@ -121,7 +121,7 @@ class Driver:
         self._last_command = 0.0 if (n := loop.robot.n_commands) == 1 else (0.0,) * n
         for rounds in loop.rounds_before(episode, is_silent=agent.delivery == "silent"):
             self._warm_up(agent, episode, rounds)
-        controller = self._answer_of(agent.name, "controller", lambda: begun(agent.acting(turn)))
+        controller = self._ask(agent.name, "controller", lambda: begun(agent.acting(turn)))
         remembering = loop.remembering if agent.sees_neurons(turn) else None
         source, conditions = list[int](), list[int]()
         if agent.delivery == "yoked":
@@ -151,7 +151,7 @@ class Driver:
 
     def _start(self, episode: int, turn: int) -> Float64[np.ndarray, " observations"]:
         """Start the robot: all agents of a round have the same start."""
-        observation = self._answer_of("the robot", "robot", lambda: self._runner.reset(turn))
+        observation = self._ask("the robot", "robot", lambda: self._runner.reset(turn))
         if not np.all(np.isfinite(observation)):
             raise Stop(Ending("robot", f"the robot starts at {observation.tolist()}"))
         self.records.append(Record({"kind": "start", "episode": episode, "observation": observation.tolist()}))
@@ -168,7 +168,7 @@ class Driver:
 
     def _choose(self, agent: Agent, controller: Controller, seen: Float64[np.ndarray, " observed"]) -> int:
         n = len(self.loop.conditions)
-        chosen = self._answer_of(agent.name, "controller", lambda: operator.index(controller.act(seen, self._rng)))
+        chosen = self._ask(agent.name, "controller", lambda: operator.index(controller.act(seen, self._rng)))
         if not 0 <= chosen < n:
             raise Stop(Ending("controller", f"{agent.name} chose {chosen}: expected a condition from 0 to {n - 1}"))
         return chosen
@@ -193,9 +193,9 @@ class Driver:
         is_burst = response["is_burst"]
         self._last_pulse_s = self._zero_s + float(after_s[0])
         again = is_burst and loop.on_burst == "repeat" and repeats < loop.most_repeats and not is_warm_up
-        came = self._remembered
+        at_trial = self._remembered
         if stimuli:
-            came = self._remember(delivered, pulse_time_s, response["rate_hz"], is_burst=is_burst)
+            at_trial = self._remember(delivered, pulse_time_s, response["rate_hz"], is_burst=is_burst)
         tick = Tick(
             number=self._n_presented,
             agent=agent.name,
@@ -223,7 +223,7 @@ class Driver:
             if tick.handled == "unfinished":
                 tick = replace(tick, **self._move(agent, x_hz, is_burst, iteration))
             if self._adaptive is not None and stimuli and (agent.calibrates or is_warm_up) and not is_burst:
-                self._adaptive.add(delivered, came, np.asarray(x_hz))
+                self._adaptive.add(delivered, at_trial, np.asarray(x_hz))
                 self._percentiles = self._adaptive.percentiles()
                 adapted["percentiles_hz"] = self._percentiles.tolist()
         finally:
@@ -258,13 +258,13 @@ class Driver:
     def _remember(
         self, condition: int, pulse_time_s: Float64[np.ndarray, " pulses"], rate_hz: Any, *, is_burst: bool
     ) -> HistoryState:
-        """Update the history state by a response; returns the state when the pulse came."""
-        came, history = self._remembered, self.loop.history
+        """Update the history state by a response; returns the state at its trial."""
+        at_trial, history = self._remembered, self.loop.history
         if history is not None:
-            is_rested = bool(pulse_time_s[0] - came.at_s > SILENCE_S)
-            came = history.when(came, float(pulse_time_s[-1]), is_rested=is_rested)
-            self._remembered = history.after(came, condition, rate_hz, is_burst=is_burst)
-        return came
+            is_rested = bool(pulse_time_s[0] - at_trial.at_s > SILENCE_S)
+            at_trial = history.when(at_trial, float(pulse_time_s[-1]), is_rested=is_rested)
+            self._remembered = history.after(at_trial, condition, rate_hz, is_burst=is_burst)
+        return at_trial
 
     def _move(
         self, agent: Agent, x_hz: Float64[np.ndarray, "*readouts"], is_burst: bool, iteration: int
@@ -276,9 +276,9 @@ class Driver:
             command = self._decoder.command(np.asarray(x_hz, np.float32)[()], self._percentiles)
             command = -command if agent.is_turned_round else command
             self._last_command = tuple(command.tolist()) if np.ndim(command) else float(command)
-        moved = self._answer_of("the robot", "robot", lambda: self._runner.step(self._last_command))
+        moved = self._ask("the robot", "robot", lambda: self._runner.step(self._last_command))
         if iteration + 1 == agent.switch_at and not moved.terminated:
-            other = self._answer_of("the robot", "robot", lambda: self._runner.switch_goal(self._n_presented))
+            other = self._ask("the robot", "robot", lambda: self._runner.switch_goal(self._n_presented))
             moved = moved._replace(observation=other)
         if not (np.isfinite(moved.reward) and np.all(np.isfinite(moved.observation))):
             raise Stop(Ending("robot", f"the robot returned {moved.observation.tolist()} with reward {moved.reward:g}"))
@@ -371,7 +371,7 @@ class Driver:
         fields = {"kind": "event", "what": ending.by, "message": ending.message, **request, **more}
         self.records.append(Record(fields))
 
-    def _answer_of(self, who: str, by: EndedBy, ask: Callable[[], T]) -> T:
+    def _ask(self, who: str, by: EndedBy, ask: Callable[[], T]) -> T:
         """The answer of the robot or an agent, by a deadline; whatever it raises ends the session."""
         self._set_deadline(who)
         try:
