@@ -130,7 +130,7 @@ def _run(arguments: list[str]) -> int:
         with interruptible(), _live_page(command):
             results = command.run()
     except BaseException as error:
-        message = _message(command, error)
+        message = _error_line(command, error)
         if message is None:
             raise
         print(f"animat: {message}", file=sys.stderr)
@@ -145,12 +145,12 @@ def _run(arguments: list[str]) -> int:
     return 1 if results.get("unreadable") or results.get("unusable") or is_refused else 0
 
 
-def _message(command: Command, error: BaseException) -> str | None:
+def _error_line(command: Command, error: BaseException) -> str | None:
     """What ended a command, in a line; None for an error of animat itself."""
     if isinstance(error, AnimatError):
         return _name_option(command, " ".join(str(error).split()))
     if isinstance(error, KeyboardInterrupt):
-        return f"interrupted{_what_is_left(command)}"
+        return f"interrupted{_how_to_resume(command)}"
     if isinstance(error, OSError) and error.errno == errno.ENAMETOOLONG:
         return f"{str(error.filename)[:60]}...: {error.strerror}; choose a shorter name"
     remedy = _MEMORY_REMEDIES.get(type(command), "use a machine with more memory").format(**vars(command))
@@ -161,8 +161,8 @@ _BEGIN_ANEW = {"maxone": "MaxOne", "replay": "replay"}
 """The cultures whose clock starts with each program."""
 
 
-def _what_is_left(command: Command) -> str:
-    """What an interrupted command has kept, and how to go on."""
+def _how_to_resume(command: Command) -> str:
+    """What an interrupted command has kept, and how to continue it."""
     if not isinstance(command, FolderCommand) or not is_folder(command.out) or not any(command.out.iterdir()):
         return ""
     if isinstance(command, Record) and command.culture in _BEGIN_ANEW and any(command.out.glob("*.nwb")):
@@ -246,14 +246,14 @@ def _parse(arguments: list[str]) -> Command:
                 description=None if fields else _DESCRIPTION,
                 args=arguments[1:] if fields else arguments,
                 config=(FlagCreatePairsOff, OmitArgPrefixes, DisallowNone),
-                registry=_options(),
+                registry=_option_registry(),
                 return_unknown_args=True,
             )
     except SystemExit as stop:
         if not stop.code:
             raise
         leading = itertools.takewhile(lambda argument: argument != "--", arguments)
-        _expect_known([word for word in leading if word[:2] == "--" and _plain(word) not in options], options, see)
+        _expect_known([word for word in leading if word[:2] == "--" and _as_in_help(word) not in options], options, see)
         for option, value in itertools.pairwise([*arguments, "--"]):
             if value.startswith("--") and not isinstance(options.get(option.replace("_", "-"), False), bool):
                 raise InvalidArgument(f"{option}: expected a value after it, got none{see}") from None
@@ -284,14 +284,14 @@ def _in_one_line(box: str, fields: Sequence[dataclasses.Field[Any]]) -> str:
     return message
 
 
-def _plain(option: str) -> str:
+def _as_in_help(option: str) -> str:
     """An option as help shows it: with dashes, without `=VALUE`."""
     return option.partition("=")[0].replace("_", "-")
 
 
 def _expect_known(unknown: Sequence[str], options: Mapping[str, Any], see: str) -> None:
     for argument in unknown[:1]:
-        option = _plain(argument)
+        option = _as_in_help(argument)
         if option in options:
             raise InvalidArgument(f"{option[2:]}: expected only its value, got {argument} before it{see}") from None
         if argument.startswith("-"):
@@ -303,7 +303,7 @@ def _expect_known(unknown: Sequence[str], options: Mapping[str, Any], see: str) 
         raise InvalidArgument(f"unexpected argument {argument!r}{hint}{see}") from None
 
 
-def _options() -> constructors.ConstructorRegistry:
+def _option_registry() -> constructors.ConstructorRegistry:
     """A rule for reading and describing the options of every command."""
     registry = constructors.ConstructorRegistry()
     within = False

@@ -18,12 +18,12 @@ _LAST = "held_last_by"
 
 
 def of_the_machine(device: str) -> Path:
-    """The folder that represents a device of which the machine has one."""
+    """The folder that stands for a device of this machine, shared by all programs."""
     return MACHINE / f"animat-{device}"
 
 
 def of_the_program(device: str) -> Path:
-    """The folder that represents a simulated device of which each program has its own; removed when it ends."""
+    """The folder that stands for a simulated device of this program alone; removed when the program ends."""
     return Path(_own_folder().name) / device
 
 
@@ -45,10 +45,10 @@ def hold(device: Path, holder: str) -> Iterator[bool]:
         except Mismatch as error:
             held = "one that another culture object holds, in this program or another: close it there first"
             raise DeviceFailed(f"{device.name}: expected a device that is not in use, got {held}") from error
-        yield _last(device, holder) != holder
+        yield _exchange_holder(device, holder) != holder
 
 
-def _last(device: Path, holder: str) -> str:
+def _exchange_holder(device: Path, holder: str) -> str:
     """The last holder, or `holder` if there was none; records `holder` as the last."""
     note = device / _LAST
     try:

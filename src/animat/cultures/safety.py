@@ -72,12 +72,12 @@ class History:
         """When the last stimulus ends; before any, too long ago for every gap."""
 
     def in_second_to(self, time_ns: int, electrode: int | None = None) -> int:
-        """Stimuli, on one electrode or on any, that began less than a second before a time not before the last."""
+        """How many stimuli, on one electrode or on any, began in the second before a time not before the last."""
         starts = self._starts_on.get(electrode, ())
         return len(starts) - bisect_right(starts, time_ns - NS)
 
     def last_on(self, electrode: int | None) -> int | None:
-        """When the last stimulus on an electrode, or on any, began, however long ago; None: there was none."""
+        """When the last stimulus on an electrode (None: on any) began; None if there was none."""
         starts = self._starts_on.get(electrode)
         return starts[-1] if starts else None
 

@@ -139,12 +139,12 @@ class Called(Actor):
 
 
 def acts(controller: object) -> bool:
-    """Whether it acts, or what it begins does."""
+    """Whether an object is a controller: it has a method `act`, or `begin`, which returns one for an episode."""
     return any(callable(getattr(controller, name, None)) for name in ("act", "begin"))
 
 
 def begun(controller: Controller) -> Controller:
-    """What acts in one episode: the controller itself, unless it remembers."""
+    """The controller of one episode: a new one from `begin` if it has this method, otherwise itself."""
     if not callable(begin := getattr(controller, "begin", None)):
         return controller
     acting: Controller = begin()
@@ -193,7 +193,7 @@ def controls_of_own(
         has_neurons = len(environment.observation_spec) > len(environment.robot.observation_spec)
         if isinstance(agent, Actor):
             actor = RobotOnly(agent) if has_neurons else agent
-            _try(name, actor, environment, simulator)
+            _expect_actions(name, actor, environment, simulator)
         elif sees_neurons(agent) and not has_neurons:
             got = "one with neural_observation, which these policies do not have"
             raise InvalidArgument(f"agents: {name}: expected one that sees the robot only, got {got}")
@@ -203,8 +203,8 @@ def controls_of_own(
     return controls
 
 
-def _try(name: str, actor: Actor, environment: Environment[Any], simulator: Neurons) -> None:
-    """Raise InvalidArgument for an actor that raises, or whose actions, which JAX would not refuse, are none."""
+def _expect_actions(name: str, actor: Actor, environment: Environment[Any], simulator: Neurons) -> None:
+    """Raise InvalidArgument for an actor that raises, or returns impossible actions, which JAX would not refuse."""
     parts = [np.shape(part) for part in jax.tree.leaves(actor)]
     if jax.tree.leaves(actor) == [actor]:
         expected = "expected a JAX pytree (jax.tree_util.register_static or register_dataclass)"

@@ -57,7 +57,7 @@ class Actor(abc.ABC):
         """Forget the episodes so far, as new ones begin."""
 
     def apart(self, run: Callable[[], T]) -> T:
-        """Run episodes in JAX such that Ctrl-C ends them soon; in another thread, without settings of this one."""
+        """Run episodes in JAX such that Ctrl-C ends them soon, in another thread if this takes one."""
         return run()
 
     def expect_no_failure(self) -> None:  # noqa: B027

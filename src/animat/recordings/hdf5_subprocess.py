@@ -56,7 +56,7 @@ def _start() -> Process:
     end_reader()
     _reader = Process("plain")
     try:
-        _reader.answer(pickle.dumps((_get_ready, (), {})), START_S)
+        _reader.answer(pickle.dumps((_import_readers, (), {})), START_S)
     except Exception as error:
         is_late = isinstance(error, TimeoutError)
         why = f"not ready after {START_S:g} s, is the machine busy?" if is_late else "is animat fully installed?"
@@ -71,7 +71,7 @@ def end_reader() -> None:
         _reader.end()
 
 
-def _get_ready() -> None:
+def _import_readers() -> None:
     """Import the readers before the time limit of a file starts."""
     from animat.recordings.formats import hdf5_formats  # noqa: F401
 
@@ -80,11 +80,11 @@ def _read(folder: Path, path: Path, part: str | None, stimuli: str | None) -> Re
     from animat.recordings.formats.hdf5_formats import read_hdf5
 
     os.chdir(folder)
-    _limit(path)
+    _limit_resources(path)
     return read_hdf5(path, part=part, stimuli=stimuli)
 
 
-def _limit(path: Path) -> None:
+def _limit_resources(path: Path) -> None:
     """Make the operating system end this process if a file takes too much time or memory."""
     import resource
 

@@ -132,13 +132,13 @@ def draw_comparisons(pairs: Sequence[Pair], title: str) -> Figure:
         whole.set_ylim(low, high + 0.2 * room)
         for axes, heading in ((whole, f"at {row.at_min:g} min"), (close, "enlarged")):
             axes.set_xlim(-0.6, 1.6)
-            axes.set_xticks([0, 1], [_name(row.first, row.score_first), _name(row.second, row.score_second)])
+            axes.set_xticks([0, 1], [_arm_label(row.first, row.score_first), _arm_label(row.second, row.score_second)])
             style_axes(axes, heading, "", "mean return of a policy")
     add_common_legend(figure, list(rows[0]), columns=2)
     return figure
 
 
-def _name(arm: str, score: float | None) -> str:
+def _arm_label(arm: str, score: float | None) -> str:
     """The arm on two lines or more, and its score on the last."""
     first, _, rest = arm.partition(" ")
     lines = [wrapped(part, _NARROW_IN) for part in (first, rest)]

@@ -127,7 +127,7 @@ class Policy:
             expect_fit(self.robot.name, self.robot.n_commands, len(self.readouts))
 
     def _expect_network(self) -> None:
-        """Refuse weights from which no meaningful action can be computed."""
+        """Refuse weights whose shapes do not fit together, or that are not finite."""
         n_outputs = 2 * self.robot.n_commands if self.n_actions is None else self.n_actions
         n_inputs = len(self.robot.observation_spec) + len(INITIAL_HISTORY) * self.neural_observation
         widths = [n_inputs, *(bias.size for bias in self.biases)]
@@ -288,7 +288,7 @@ class Policy:
         robot or mapping is not registered here.
         """
         path = expect_plain_file(path, _MOST_BYTES)
-        arrays, description = _read(path)
+        arrays, description = _read_arrays(path)
         try:
             return Policy(
                 weights=tuple(arrays[f"layer{i}.weight"] for i in range(_LAYERS)),
@@ -325,7 +325,7 @@ def _squash(z: Float64[np.ndarray, " commands"]) -> float | Float64[np.ndarray, 
     return math.tanh(z[0]) if len(z) == 1 else np.tanh(z)
 
 
-def _read(path: Path) -> tuple[dict[str, np.ndarray[Any, Any]], dict[str, Any]]:
+def _read_arrays(path: Path) -> tuple[dict[str, np.ndarray[Any, Any]], dict[str, Any]]:
     """A policy's arrays and its description; a file with other arrays is refused unread."""
     from safetensors import SafetensorError, safe_open
 

@@ -66,7 +66,7 @@ def read_response_npz(path: Path) -> ResponseTable | None:
     window_ms = None if window is None else (float(window[0]), float(window[1]))
     columns = {"channel_label": np.arange(n_channels), **arrays}
     provenance = {"source": path.name, "format": "NPZ of responses"}
-    return _table(values, NPZ_KEYS[key], columns, window_ms, provenance, left_out_findings("keys", left_out))
+    return _to_table(values, NPZ_KEYS[key], columns, window_ms, provenance, left_out_findings("keys", left_out))
 
 
 def read_response_table(table: TextTable) -> ResponseTable | None:
@@ -74,7 +74,7 @@ def read_response_table(table: TextTable) -> ResponseTable | None:
     if not _is_response_table(table):
         return None
     is_long = table.place(("channel",)) is not None
-    values, kind, labels, first_of = _long(table) if is_long else _wide(table)
+    values, kind, labels, first_of = _read_long(table) if is_long else _read_wide(table)
     columns: dict[str, Any] = {"channel_label": labels}
     for name, names in TABLE_COLUMNS.items():
         if (place := table.place(names)) is not None:
@@ -87,10 +87,10 @@ def read_response_table(table: TextTable) -> ResponseTable | None:
     table.note_left_out([alias for name, names in TABLE_COLUMNS.items() if name not in columns for alias in names])
     window_ms = None if start_ms is None or end_ms is None else (start_ms, end_ms)
     provenance = {"source": table.path.name, "format": "CSV of responses"}
-    return _table(values, kind, columns, window_ms, provenance, tuple(table.findings))
+    return _to_table(values, kind, columns, window_ms, provenance, tuple(table.findings))
 
 
-def _wide(table: TextTable) -> _Read:
+def _read_wide(table: TextTable) -> _Read:
     """Read a table with one line per stimulus."""
     places = {kind: [i for i, h in enumerate(table.header) if folded(h).startswith(f"{kind}_")] for kind in KINDS}
     kinds = [kind for kind in KINDS if places[kind]]
@@ -111,7 +111,7 @@ def _label(head: str, kind: ResponseKind) -> str:
     return next(head[i:].strip() for i in range(len(head) + 1) if folded(f"{head[:i]}x") == f"{kind}_x")
 
 
-def _long(table: TextTable) -> _Read:
+def _read_long(table: TextTable) -> _Read:
     """Read a table with one line per stimulus and channel."""
     places = {kind: place for kind in KINDS if (place := table.place((kind,))) is not None}
     trial, channel = table.place((TRIAL, *TABLE_COLUMNS["stimulus_time_s"])), table.place(("channel",))
@@ -166,7 +166,7 @@ def _constant(table: TextTable, name: str) -> float | None:
     return float(values[0])
 
 
-def _table(
+def _to_table(
     values: Column,
     kind: ResponseKind,
     columns: dict[str, Any],
