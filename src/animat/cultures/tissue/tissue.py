@@ -122,7 +122,7 @@ class Tissue:
             raise
         self._now_ns = end_ns
         self._set_kicks(self._kicks_to_come)
-        # Usually one part: concatenating it with nothing would add 1 % to the cost of 12.5 ms.
+        # Usually there is one part, which is not copied: that would add 1 % to the cost of 12.5 ms.
         return parts[0] if len(parts) == 1 else Spikes(*map(np.concatenate, zip(NO_SPIKES, *parts, strict=True)))
 
     def rest(self, duration_s: float) -> None:
