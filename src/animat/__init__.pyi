@@ -73,7 +73,8 @@ from animat.training.lessons import Lesson as Lesson
 from animat.execution.curves import CurveRow as CurveRow, TrainingCallback as TrainingCallback
 from animat.execution.training import train as train
 from animat.training.policy import Policy as Policy, load_policies as load_policies
-from animat.evaluation.table import Evaluation as Evaluation, evaluate as evaluate
+from animat.evaluation.result import Evaluation as Evaluation
+from animat.evaluation.table import evaluate as evaluate
 from animat.evaluation.optimum import Optimum as Optimum, best_return as best_return, best_returns as best_returns
 from animat.evaluation.optimal_returns import optimal_returns as optimal_returns
 from animat.evaluation.statistics import compare as compare

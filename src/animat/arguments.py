@@ -80,7 +80,7 @@ def checked_arguments(thing: Thing) -> Thing:
         try:
             given = signature.bind(*args, **kwargs).arguments
         except TypeError:
-            return function(*args, **kwargs)  # Python says what is missing or too much.
+            return function(*args, **kwargs)  # Raises Python's own error for missing or unexpected arguments.
         for name in names:
             if name in given:
                 check_argument(name, given[name], _hints(function).get(name, Any))
@@ -91,7 +91,7 @@ def checked_arguments(thing: Thing) -> Thing:
 
 def check_argument(name: str, value: Any, hint: Any) -> None:
     """Raise InvalidArgument for a single argument that is not of a kind; for where the decorator cannot stand."""
-    if strangers := _strangers(value, hint):
+    if strangers := _unfitting(value, hint):
         raise InvalidArgument(f"{name}: expected {_words(hint)}, got {shown(strangers[0])}")
 
 
@@ -100,11 +100,11 @@ def _hints(function: Callable[..., Any]) -> dict[str, Any]:
     return get_type_hints(function)
 
 
-def _strangers(value: Any, hint: Any) -> list[Any]:
-    """The value, if it is not of the kind, or those in it that are not."""
+def _unfitting(value: Any, hint: Any) -> list[Any]:
+    """The value if it does not fit the annotation, or the items in it that do not; empty if all fits."""
     kind, inner = get_origin(hint) or hint, get_args(hint)
     if kind in (Union, UnionType):
-        return [value] if all(_strangers(value, each) for each in inner) else []
+        return [value] if all(_unfitting(value, each) for each in inner) else []
     if kind is Any or not isinstance(kind, type) or kind.__module__ == "jaxtyping":
         return []
     if issubclass(kind, np.ndarray):
@@ -116,13 +116,13 @@ def _strangers(value: Any, hint: Any) -> list[Any]:
     elif inner and issubclass(kind, Mapping):
         if isinstance(value, Mapping):
             pairs = [pair for item in value.items() for pair in zip(item, inner, strict=True)]
-            return [stranger for each, its in pairs for stranger in _strangers(each, its)]
+            return [stranger for each, its in pairs for stranger in _unfitting(each, its)]
         fits = False
     elif inner and issubclass(kind, Iterable):
         fits = isinstance(value, Iterable) and not isinstance(value, str | bytes | Mapping)
-        # What can be read only once is left to the function.
+        # The items of an iterator cannot be checked without consuming it.
         if fits and isinstance(value, Collection):
-            return [stranger for each in value for stranger in _strangers(each, inner[0])]
+            return [stranger for each in value for stranger in _unfitting(each, inner[0])]
     else:
         fits = isinstance(value, _NUMBERS.get(kind, kind))
     return [] if fits else [value]

@@ -56,7 +56,7 @@ def interruptible() -> Iterator[None]:
         if not _is_importing(frame) or time.monotonic() > waits_since_s + _LONGEST_IMPORT_S:
             waits_since_s = 0.0
             raise KeyboardInterrupt
-        # Not a `Thread`: it takes a lock, which the interrupted code may hold.
+        # `Thread` cannot be used: it takes a lock that the interrupted code may hold.
         retry()
 
     def hook(unraisable: Any) -> None:
@@ -91,7 +91,7 @@ def handled(numbers: tuple[signal.Signals, ...], handler: Callable[..., None]) -
 
 
 def _is_importing(frame: FrameType | None) -> bool:
-    # Without a frame, `walk_stack` walks its own caller's.
+    # `walk_stack(None)` would walk the stack of its own caller.
     return frame is not None and any(
         each.f_code.co_filename == "<frozen importlib._bootstrap>" for each, _ in walk_stack(frame)
     )

@@ -158,7 +158,7 @@ class Animat(Environment[RobotState]):
     n_conditions: int
 
     def __post_init__(self) -> None:
-        # Not by the decorator: what checks types in the tests would read these annotations as those of its file.
+        # Not by `checked_arguments`: the type checker of the tests would resolve annotations in the decorator's module.
         check_argument("robot", self.robot, Robot)
         check_argument("mapping", self.mapping, Mapping)
 

@@ -27,7 +27,7 @@ class AnimatError(Exception):
     is_admitted = False
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # Errors travel between processes, and some take other arguments than their message.
+        # Errors are pickled between processes, and the constructors of some take more than the message.
         return copyreg.__newobj__, (type(self), *self.args), self.__dict__  # type: ignore[attr-defined]
 
 
@@ -163,14 +163,14 @@ def first_line(error: BaseException, *, with_place: bool = True) -> str:
     first, *others = str(error).strip().split("\n")
     message = f"{type(error).__name__}: {first[:300] or 'no more is known'}"
     if others and first.endswith("Traceback (most recent call last):"):
-        # JAX quotes the traceback of what a callback raised; it ends with that error.
+        # JAX quotes the whole traceback of a callback's error, which is its last line.
         message = others[-1][:300]
     return "".join(filter(str.isprintable, message)) + (_place_in_own_file(error) if with_place else "")
 
 
 def _place_in_own_file(error: BaseException) -> str:
     if isinstance(error, SyntaxError):
-        # Its message names the place.
+        # The message of a SyntaxError already names the place.
         return ""
     frames = traceback.walk_tb(error.__traceback__)
     places = [(Path(frame.f_code.co_filename), line) for frame, line in frames]

@@ -44,7 +44,7 @@ def expect_no_other(folder: Path, kind: Kind) -> None:
         return
     found = {each: [file.name for name in names for file in folder.glob(name)] for each, names in MARKERS.items()}
     others = ", ".join(f"{_DESCRIPTIONS[each]} ({min(names)})" for each, names in found.items() if names)
-    # Work of this kind continues, whatever else is in the folder.
+    # A folder that already has work of this kind is continued, whatever else is in it.
     if others and not found[kind]:
         wanted = _DESCRIPTIONS[kind]
         raise Mismatch(f"{folder}: expected a folder for {wanted}, got one with {others}; choose another folder")
@@ -70,7 +70,7 @@ def first_difference(
         and isinstance(wanted, list)
         and (len(found) == len(wanted) or max(len(repr(found)), len(repr(wanted))) > _LONGEST)
     ):
-        # The entries that both have, then the lengths.
+        # Compare the entries that both lists have, then their lengths.
         pairs = [(one, other, f"{name}[{i}]") for i, (one, other) in enumerate(zip(found, wanted, strict=False))]
         pairs += [(len(found), len(wanted), f"{name}, how many")]
     else:

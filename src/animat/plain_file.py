@@ -30,7 +30,7 @@ def expect_plain_file(path: str | os.PathLike[str], most_bytes: int | None = Non
     if most_bytes is not None and size > most_bytes:
         raise InvalidFile(f"{path}: expected at most {most_bytes:,} bytes, got {size:,}")
     if not os.access(path, os.R_OK):
-        # Some readers would call it damaged, or missing.
+        # Checked here, as some readers would report the file as damaged or missing.
         raise InvalidFile(f"{path}: cannot be read: {os.strerror(errno.EACCES)}")
     return path
 
@@ -63,7 +63,7 @@ def read_plain_text(path: str | os.PathLike[str], most_bytes: int) -> str:
     if len(content) > most_bytes:
         raise InvalidFile(f"{path}: expected at most {most_bytes:,} bytes, got more")
     try:
-        # Editors of Windows begin such files with a mark, as spreadsheets do with tables.
+        # Windows editors and spreadsheets begin UTF-8 files with a byte order mark.
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InvalidFile(f"{path}: expected text in UTF-8, got something else ({error.reason})") from error

@@ -59,7 +59,7 @@ class Process:
                 raise TimeoutError(f"no answer within {within_s:g} s")
             answer = pickle.load(self._popen.stdout)
         except BaseException as error:
-            self.kill()  # It may still be running, with nobody to read its answer.
+            self.kill()  # It may still be running, but its answer would no longer be read.
             status = self._popen.wait()
             if isinstance(error, BrokenPipeError | EOFError | pickle.UnpicklingError):
                 raise BrokenExecutor(f"its process ended with status {status}") from error
@@ -130,10 +130,10 @@ def pin_worker(core: int | None) -> None:
         os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
         os.environ.setdefault("JAX_DEFAULT_MATMUL_PRECISION", "highest")
     else:
-        # Libraries start as many threads as there are usable cores, and one pinned core beats two shared ones.
+        # Pinned first: libraries start a thread per usable core, and one pinned core is faster than two shared ones.
         if hasattr(os, "sched_setaffinity"):
             os.sched_setaffinity(0, {core})
-        # A few networks of 64 units do not fill a GPU, and all workers would take the same one.
+        # Without the GPU: all workers would share it, and a few networks of 64 units do not fill it.
         os.environ["JAX_PLATFORMS"] = "cpu"
     end_with_parent()
 
@@ -151,7 +151,7 @@ def _pinned_processes() -> Counter[int]:
     """How many processes of this module are pinned to each core, whoever started them."""
     pinned = Counter[int]()
     for file in Path("/proc").glob("[0-9]*/cmdline"):
-        # It may have ended, or be hidden.
+        # The process may have ended meanwhile, or be another user's.
         with suppress(OSError):
             words = file.read_bytes().split(b"\0")
             if b"animat.process" in words[:-2] and words[-2].isdigit():

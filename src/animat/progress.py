@@ -199,7 +199,7 @@ class Bar:
             from rich.live import Live
 
             self._live = Live(
-                get_renderable=self._drawn,
+                get_renderable=self._rendered,
                 console=Console(stderr=True),
                 # Printed text appears above the bar; if standard output is a file or a pipe, it is unaffected.
                 redirect_stdout=sys.stdout.isatty(),
@@ -237,7 +237,7 @@ class Bar:
             self._printed_s, self._printed = now_s, news
             print(", ".join(filter(None, [done, *counted, phase.left(), phase.note])), file=sys.stderr, flush=True)
 
-    def _drawn(self) -> RenderableType:
+    def _rendered(self) -> RenderableType:
         """The phases one below the other, then further details of the last, cut to the terminal's width."""
         from rich.console import Group
         from rich.progress_bar import ProgressBar

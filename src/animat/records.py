@@ -139,7 +139,7 @@ def _message(error: ValidationError, kind: Any, within: str = "") -> str:
     if mistake["type"] == "unexpected_positional_argument":
         return f"{within}{': ' if within else ''}expected at most {len(kind.__pydantic_fields__)} values"
     if loc and isinstance(loc[0], int) and hasattr(kind, "__pydantic_fields__"):
-        # A positional argument.
+        # A positional argument is located by its number: use its name.
         loc = (list(kind.__pydantic_fields__)[loc[0]], *loc[1:])
     where = ".".join([within] * bool(within) + [_key(part) for part in loc if isinstance(part, str)])
     if mistake["type"] == "unexpected_keyword_argument":
@@ -163,7 +163,7 @@ def _expected(mistake: ErrorDetails) -> str:
     words = _EXPECTED.get(mistake["type"], mistake["msg"])
     expected, given = words.format(**mistake.get("ctx", {})), shown(mistake["input"])
     if mistake["type"].startswith(("greater", "less")):
-        # On the command line whole numbers, too, become floats.
+        # On the command line whole numbers become floats, such as 5.0.
         expected, given = expected.removesuffix(".0"), given.removesuffix(".0")
     return f"{expected}, got {given}"
 

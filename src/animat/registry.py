@@ -127,7 +127,7 @@ class Registry(Generic[Thing]):
     def name_of(self, name: str) -> str:
         """The registered name for any form of `name` that `named` accepts; raises as `named` does."""
         if (family := self._family_of(name)) is not None:
-            # Not looked up, as it may need parameters that are not known here.
+            # Its class is not looked up: it may need parameters that are not known here.
             family.import_module(name.partition(":")[2])
             return name
         return name if name in self._ours else str(self.class_named(name).name)  # type: ignore[attr-defined]

@@ -32,7 +32,7 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     with as_invalid_file(path, "cannot be written"):
         path.parent.mkdir(parents=True, exist_ok=True)
         temporary = path.parent / f".{path.name}.{secrets.token_hex(4)}.partial{path.suffix}"
-        # Exclusively, as two processes may write the same file.
+        # Must be new: two processes may write the same file at the same time.
         temporary.touch(exist_ok=False)
     with as_invalid_file(path, "cannot be written", UNCHANGED):
         try:
@@ -67,7 +67,7 @@ def expect_writable(folder: str | os.PathLike[str], option: str = "--out", room_
                     f"{folder}: cannot be written: {missing}; mount or make it, or choose another {option}"
                 )
             existing = existing.parent
-        # Permissions would not reveal a full disk or a read-only file system.
+        # Write to find out: permissions do not reveal a full disk or a read-only file system.
         with tempfile.TemporaryFile(dir=existing):
             free = shutil.disk_usage(existing).free
     except OSError as error:
@@ -101,7 +101,7 @@ def exclusive_lock(folder: str | os.PathLike[str]) -> Iterator[None]:
             raise InvalidFile(f"{folder}: expected a folder, got a file; choose another --out")
         created = [each for each in (folder, *folder.parents) if not each.exists()]
         if created or not any(folder.iterdir()):
-            # A folder with a finished run may be read-only; in an empty one nothing could be done.
+            # Only an empty folder must be writable: one with a finished run may be read-only.
             expect_writable(folder)
         folder.mkdir(parents=True, exist_ok=True)
         descriptors = [os.open(folder, os.O_RDONLY)]
@@ -163,7 +163,7 @@ def is_unfinished(path: Path) -> bool:
 
 def sync_folder(folder: Path) -> None:
     """Put a folder's names on disk too: otherwise a file renamed just before a power cut may be the old one."""
-    # Some file systems cannot, and do it when they see fit.
+    # Some file systems cannot sync a folder on request.
     with suppress(OSError):
         descriptor = os.open(folder, os.O_RDONLY)
         try:

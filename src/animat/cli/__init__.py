@@ -91,7 +91,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             # Here, where errors can be caught, not while Python exits: help ends with SystemExit.
             sys.stdout.flush()
     except KeyboardInterrupt:
-        # Before the command began.
+        # Ctrl-C while the command was being loaded.
         print("animat: interrupted", file=sys.stderr)
         return 130
     except OSError as error:
@@ -119,7 +119,7 @@ def _run(arguments: list[str]) -> int:
     try:
         Path.cwd()
     except OSError as error:
-        # Libraries ask for it, and what they cannot do without it would be blamed on a recording.
+        # Libraries need it, and their errors would be taken for those of a recording.
         got = f"expected one, got none ({error.strerror}): cd to one that exists"
         print(f"animat: working folder: {got}", file=sys.stderr)
         return 1
@@ -130,7 +130,7 @@ def _run(arguments: list[str]) -> int:
         with interruptible(), _live_page(command):
             results = command.run()
     except BaseException as error:
-        message = _message(command, error)
+        message = _error_line(command, error)
         if message is None:
             raise
         print(f"animat: {message}", file=sys.stderr)
@@ -145,12 +145,12 @@ def _run(arguments: list[str]) -> int:
     return 1 if results.get("unreadable") or results.get("unusable") or is_refused else 0
 
 
-def _message(command: Command, error: BaseException) -> str | None:
+def _error_line(command: Command, error: BaseException) -> str | None:
     """What ended a command, in a line; None for an error of animat itself."""
     if isinstance(error, AnimatError):
         return _name_option(command, " ".join(str(error).split()))
     if isinstance(error, KeyboardInterrupt):
-        return f"interrupted{_what_is_left(command)}"
+        return f"interrupted{_how_to_resume(command)}"
     if isinstance(error, OSError) and error.errno == errno.ENAMETOOLONG:
         return f"{str(error.filename)[:60]}...: {error.strerror}; choose a shorter name"
     remedy = _MEMORY_REMEDIES.get(type(command), "use a machine with more memory").format(**vars(command))
@@ -161,8 +161,8 @@ _BEGIN_ANEW = {"maxone": "MaxOne", "replay": "replay"}
 """The cultures whose clock starts with each program."""
 
 
-def _what_is_left(command: Command) -> str:
-    """What an interrupted command has kept, and how to go on."""
+def _how_to_resume(command: Command) -> str:
+    """What an interrupted command has kept, and how to continue it."""
     if not isinstance(command, FolderCommand) or not is_folder(command.out) or not any(command.out.iterdir()):
         return ""
     if isinstance(command, Record) and command.culture in _BEGIN_ANEW and any(command.out.glob("*.nwb")):
@@ -246,49 +246,56 @@ def _parse(arguments: list[str]) -> Command:
                 description=None if fields else _DESCRIPTION,
                 args=arguments[1:] if fields else arguments,
                 config=(FlagCreatePairsOff, OmitArgPrefixes, DisallowNone),
-                registry=_options(),
+                registry=_option_registry(),
                 return_unknown_args=True,
             )
     except SystemExit as stop:
         if not stop.code:
             raise
         leading = itertools.takewhile(lambda argument: argument != "--", arguments)
-        _expect_known([word for word in leading if word[:2] == "--" and _plain(word) not in options], options, see)
+        _expect_known([word for word in leading if word[:2] == "--" and _as_in_help(word) not in options], options, see)
         for option, value in itertools.pairwise([*arguments, "--"]):
             if value.startswith("--") and not isinstance(options.get(option.replace("_", "-"), False), bool):
                 raise InvalidArgument(f"{option}: expected a value after it, got none{see}") from None
-        # A box with a title; on terminals without these characters, lines of dashes, one of them under the title.
-        lines = [line.strip("│╭╮╰╯ ") for line in output.getvalue().splitlines()[1:]]
-        parts = itertools.groupby(lines, lambda line: bool(line) and not line.strip("─-"))
-        message = next(" ".join(line for line in part if line) for is_rule, part in parts if not is_rule)
-        message = message.removeprefix("Error parsing ")
-        if message.startswith("Missing from "):
-            message = f"{message.partition(': ')[2].split()[0]}: expected a value, got none"
-        if message.startswith("Missing value for argument '"):
-            _, option, expected = message.split("'")
-            dash = f"a value after it, got one that begins with a dash: write {option}=VALUE"
-            message = f"{option}: expected {'two numbers, got one' if ' 2 ' in expected else dash}"
-        if message.startswith("{") or message.partition(":")[0].isupper():
-            # The choices or the kind of a positional argument, in place of its name.
-            named = next(field.name for field in fields if "Positional" in str(field.type))
-            message = f"{named}: {message.partition(': ')[2]}"
-        raise InvalidArgument(f"{message}{see}") from None
+        raise InvalidArgument(f"{_in_one_line(output.getvalue(), fields)}{see}") from None
     _expect_known(unknown, options, see)
     return command
 
 
-def _plain(option: str) -> str:
+def _in_one_line(box: str, fields: Sequence[dataclasses.Field[Any]]) -> str:
+    """Tyro's error in our words; `fields` are those of the command.
+
+    It is in a box with a title; on terminals without these characters, in lines of dashes, one of them under the title.
+    """
+    lines = [line.strip("│╭╮╰╯ ") for line in box.splitlines()[1:]]
+    parts = itertools.groupby(lines, lambda line: bool(line) and not line.strip("─-"))
+    message = next(" ".join(line for line in part if line) for is_rule, part in parts if not is_rule)
+    message = message.removeprefix("Error parsing ")
+    if message.startswith("Missing from "):
+        message = f"{message.partition(': ')[2].split()[0]}: expected a value, got none"
+    if message.startswith("Missing value for argument '"):
+        _, option, expected = message.split("'")
+        dash = f"a value after it, got one that begins with a dash: write {option}=VALUE"
+        message = f"{option}: expected {'two numbers, got one' if ' 2 ' in expected else dash}"
+    if message.startswith("{") or message.partition(":")[0].isupper():
+        # The choices or the kind of a positional argument, in place of its name.
+        named = next(field.name for field in fields if "Positional" in str(field.type))
+        message = f"{named}: {message.partition(': ')[2]}"
+    return message
+
+
+def _as_in_help(option: str) -> str:
     """An option as help shows it: with dashes, without `=VALUE`."""
     return option.partition("=")[0].replace("_", "-")
 
 
 def _expect_known(unknown: Sequence[str], options: Mapping[str, Any], see: str) -> None:
     for argument in unknown[:1]:
-        option = _plain(argument)
+        option = _as_in_help(argument)
         if option in options:
             raise InvalidArgument(f"{option[2:]}: expected only its value, got {argument} before it{see}") from None
         if argument.startswith("-"):
-            # As in the commands that stimulate a culture besides; only `record` has sessions.
+            # Other commands have --culture-seed; `record`, which alone has --sessions, has --seed.
             is_meant = option == "--culture-seed" and "--sessions" in options
             hint = "; did you mean --seed?" if is_meant else did_you_mean(option, options) or see
             raise InvalidArgument(f"unknown option {argument}{hint}") from None
@@ -296,7 +303,7 @@ def _expect_known(unknown: Sequence[str], options: Mapping[str, Any], see: str) 
         raise InvalidArgument(f"unexpected argument {argument!r}{hint}{see}") from None
 
 
-def _options() -> constructors.ConstructorRegistry:
+def _option_registry() -> constructors.ConstructorRegistry:
     """A rule for reading and describing the options of every command."""
     registry = constructors.ConstructorRegistry()
     within = False
@@ -337,7 +344,7 @@ def _option(option: constructors.StructFieldSpec) -> constructors.StructFieldSpe
             raise ValueError(f"expected {expected}, got {' '.join(map(repr, words))}")
 
         if expected is not None:
-            # Two numbers that may be left out would be in braces, as choices are.
+            # Without the braces in which tyro shows two optional numbers, as if they were choices.
             metavar = spec.metavar if spec.choices else spec.metavar.strip("{}")
             kind = Annotated[kind, dataclasses.replace(spec, instance_from_str=read, choices=None, metavar=metavar)]
     # Flags are off unless given.

@@ -117,7 +117,7 @@ class StimulationOptions(FolderCommand):
     """Seconds beyond the expected time that a culture, robot or agent may take before the session ends"""
 
     def _check_culture_seed(self) -> None:
-        # Later it would be called `seed`, as the policies' is.
+        # Checked here, as a later error would call it `seed`, like the policies'.
         expect_at_least("--culture-seed", self.culture_seed, 0)
         if self.culture_seed is not None and self.culture == "maxone":
             raise InvalidArgument(f"--culture-seed: expected none for --culture maxone, got {self.culture_seed}")
@@ -343,5 +343,5 @@ def read_sac(pairs: Sequence[str]) -> SAC:
     try:
         return SAC(**numbers)  # type: ignore[arg-type]
     except InvalidArgument as error:
-        # An option has no tables, of which a setting could be at the top.
+        # "At the top" is meant for files, whose settings may be in tables.
         raise InvalidArgument(f"--sac: {str(error).replace(' at the top', '')}") from error

@@ -16,7 +16,11 @@ from animat.progress import Bar, Part, Progress
 from animat.writing import expect_writable
 
 if TYPE_CHECKING:
+    from animat.recordings.recording import Recording, ResponseTable
+    from animat.responses.conditions import Conditions
+    from animat.responses.inspection import Inspection
     from animat.responses.responses import Responses
+    from animat.responses.windows import Window
 
 
 @dataclass(frozen=True)
@@ -39,12 +43,10 @@ class Inspect(ResponseOptions):
 
     def run(self) -> dict[str, Any]:
         from animat.recordings.placing import placed_by_date
-        from animat.recordings.reading import list_recordings, read_source
-        from animat.report.inspection import draw_inspection, expect_unique_stems, finding_lines, inspection_text
+        from animat.recordings.reading import list_recordings
+        from animat.report.inspection import expect_unique_stems
         from animat.responses.bursts import check_threshold
         from animat.responses.conditions import conditions_named
-        from animat.responses.inspection import inspect_recording
-        from animat.responses.quality.one_culture import series_findings, unlike_finding
         from animat.responses.windows import DEFAULT_WINDOW_MS, check_window
         from animat.robots.grid import grid_for
         from animat.robots.registry import robot_named
@@ -73,9 +75,7 @@ class Inspect(ResponseOptions):
             for number, file in enumerate(files):
                 progress.update(steps * number, total, file.name)
                 try:
-                    source = read_source(file, stimuli=self.stimuli, part=self.part)
-                    with within(file, (UnusableData, Mismatch)):
-                        inspection = inspect_recording(source, by, window_ms, self.burst_threshold, file.name)
+                    source, inspection = self._inspect(file, by, window_ms)
                 except AnimatError as error:
                     if len(files) == 1:
                         raise
@@ -83,30 +83,13 @@ class Inspect(ResponseOptions):
                     print(f"animat: {' '.join(str(error).split())}", file=sys.stderr)
                     unreadable.append(str(file))
                     continue
-                print(inspection_text(inspection), end="\n\n")
-                inspected.append(inspection.to_dict())
-                if self.optimum is not None:
-                    # It takes far longer than reading.
-                    part = Part(progress, steps * number, 1, total, f"{file.name}, optimal return")
-                    inspected[-1]["optima"] = _optima(self.optimum, inspection.responses, part)
-                if self.out is not None:
-                    progress.update(steps * number + 1, total, f"{file.name}, figures")
-                    figures = [str(figure) for figure in draw_inspection(source, inspection, self.out, drawn_as)]
-                    print(f"figures: {', '.join(figures)}\n")
-                    inspected[-1]["figures"] = figures
+                one = Part(progress, steps * number, steps, total)
+                inspected.append(self._show(source, inspection, drawn_as, one))
                 series.append((file, inspection.responses))
             unusable = [each["name"] for each in inspected if each["verdict"] == "not usable"]
             results: dict[str, Any] = {"recordings": inspected, "unreadable": unreadable, "unusable": unusable}
             of_files = placed_by_date([responses for _, responses in series])
-            for each, responses in zip(inspected, of_files, strict=True):
-                each["start_min"] = responses.start_min
-            placed = {finding for each in of_files for finding in each.findings if finding.name == "placed-by-date"}
-            if together := [*placed, *unlike_finding(of_files), *series_findings(of_files)]:
-                # Above, each file was printed with the start that it states.
-                starts = ", ".join(f"{each['name']} from {in_min(each['start_min'])}" for each in inspected)
-                lines = ["all together:", *([f"  {starts}"] if placed else []), *finding_lines(together)]
-                print("\n".join(lines), end="\n\n")
-            results["together"] = [{**finding.to_dict(), "value": finding.value} for finding in together]
+            results["together"] = _compare(inspected, of_files)
             if self.out is not None and series:
                 progress.update(total - 1, total, "figures of the series")
                 results |= self._draw_series([file for file, _ in series], of_files, self.out)
@@ -114,6 +97,35 @@ class Inspect(ResponseOptions):
             others = "; the rest were inspected" if inspected else ""
             print(f"animat: {len(unreadable)} of {len(files)} files could not be inspected{others}", file=sys.stderr)
         return results
+
+    def _inspect(
+        self, file: Path, by: Conditions | None, window_ms: Window
+    ) -> tuple[Recording | ResponseTable, Inspection]:
+        from animat.recordings.reading import read_source
+        from animat.responses.inspection import inspect_recording
+
+        source = read_source(file, stimuli=self.stimuli, part=self.part)
+        with within(file, (UnusableData, Mismatch)):
+            return source, inspect_recording(source, by, window_ms, self.burst_threshold, file.name)
+
+    def _show(
+        self, source: Recording | ResponseTable, inspection: Inspection, drawn_as: Any, progress: Progress
+    ) -> dict[str, Any]:
+        """Print what was found in a file, and draw its figures; returns it for JSON."""
+        from animat.report.inspection import draw_inspection, inspection_text
+
+        print(inspection_text(inspection), end="\n\n")
+        found = inspection.to_dict()
+        if self.optimum is not None:
+            # It takes far longer than reading.
+            part = Part(progress, 0, 1, 1 if self.out is None else 2, f"{inspection.name}, optimal return")
+            found["optima"] = _optima(self.optimum, inspection.responses, part)
+        if self.out is not None:
+            progress.update(1, 2, f"{inspection.name}, figures")
+            figures = [str(figure) for figure in draw_inspection(source, inspection, self.out, drawn_as)]
+            print(f"figures: {', '.join(figures)}\n")
+            found["figures"] = figures
+        return found
 
     def _draw_series(self, files: Sequence[Path], series: Sequence[Responses], out: Path) -> dict[str, Any]:
         """Draw the files' responses together, with the array of the first recording; returns the figures, if any."""
@@ -132,6 +144,22 @@ class Inspect(ResponseOptions):
         if drawn:
             print(f"figures of the series: {', '.join(map(str, drawn))}")
         return {"figures": [str(figure) for figure in drawn]}
+
+
+def _compare(inspected: Sequence[dict[str, Any]], series: Sequence[Responses]) -> list[dict[str, Any]]:
+    """Print and return what is found on the files together; adds to each of `inspected` when it began."""
+    from animat.report.inspection import finding_lines
+    from animat.responses.quality.one_culture import series_findings, unlike_finding
+
+    for each, responses in zip(inspected, series, strict=True):
+        each["start_min"] = responses.start_min
+    placed = {finding for each in series for finding in each.findings if finding.name == "placed-by-date"}
+    if together := [*placed, *unlike_finding(series), *series_findings(series)]:
+        # Above, each file was printed with the start that it states.
+        starts = ", ".join(f"{each['name']} from {in_min(each['start_min'])}" for each in inspected)
+        lines = ["all together:", *([f"  {starts}"] if placed else []), *finding_lines(together)]
+        print("\n".join(lines), end="\n\n")
+    return [{**finding.to_dict(), "value": finding.value} for finding in together]
 
 
 def _optima(robot: str, responses: Responses, progress: Progress) -> list[dict[str, Any]] | None:

@@ -17,6 +17,8 @@ from animat.writing import exclusive_lock
 
 if TYPE_CHECKING:
     from animat.live.shadowing import LiveRun
+    from animat.stimulation.protocol import Protocol
+    from animat.training.specification import Training
 
 
 @dataclass(frozen=True)
@@ -67,15 +69,12 @@ class Live(StimulationOptions):
     """Folder for recordings, policies, the session, and live.log"""
 
     def run(self) -> dict[str, Any]:
-        from animat.coding.mapping import mapping_named
         from animat.compilation import keep_compilations
-        from animat.cultures.kinds import culture_of, pulse_for
+        from animat.cultures.kinds import culture_of
         from animat.live.plan import Timetable, check_plan
         from animat.live.shadowing import live
         from animat.progress import Bar
         from animat.recordings.reading import read_recordings
-        from animat.stimulation.protocol import Protocol, read_protocol
-        from animat.training.specification import Training
 
         simulated = self.culture in ("virtual", "replay")
         if self.speed is not None and self.speed != 1 and not simulated:
@@ -88,23 +87,7 @@ class Live(StimulationOptions):
         self._check_culture_seed()
         speed = (30.0 if simulated else 1.0) if self.speed is None else self.speed
         timetable = Timetable(self.interval_min, self.duration_min, speed)
-        robot = robot_for(self.robot, self.goal)
-        training = Training(
-            robot,
-            mapping_named(self.mapping),
-            policies=self.policies,
-            iterations=robot.paper_iterations,
-            seed=self.seed,
-            percentiles=self.percentiles,
-            algorithm=read_sac(self.sac),
-        )
-        account = self._account()
-        protocol = Protocol(order="mixed", trials=500, pulse=pulse_for(self.culture))
-        given = {name: value for name in ("order", "pulses", "trials") if (value := getattr(self, name)) is not None}
-        if given and self.protocol is not None:
-            options = ", ".join(f"--{name}" for name in given)
-            raise InvalidArgument(f"--protocol: expected it alone, got {options} too; put them in the file")
-        protocol = replace(protocol, **given) if self.protocol is None else read_protocol(self.protocol, protocol)
+        training, account, protocol = self._training(), self._account(), self._protocol()
         settings = self._loop_settings()
         check_plan(training, protocol, self.out, timetable, self.episodes, settings, account)
         keep_compilations()
@@ -136,6 +119,35 @@ class Live(StimulationOptions):
             # Reported even if closing the culture fails.
             stack.callback(self._report, ran)
         return ran.to_dict()
+
+    def _training(self) -> Training:
+        from animat.coding.mapping import mapping_named
+        from animat.training.specification import Training
+
+        robot = robot_for(self.robot, self.goal)
+        return Training(
+            robot,
+            mapping_named(self.mapping),
+            policies=self.policies,
+            iterations=robot.paper_iterations,
+            seed=self.seed,
+            percentiles=self.percentiles,
+            algorithm=read_sac(self.sac),
+        )
+
+    def _protocol(self) -> Protocol:
+        """The protocol of the file, or of the options that it replaces."""
+        from animat.cultures.kinds import pulse_for
+        from animat.stimulation.protocol import Protocol, read_protocol
+
+        usual = Protocol(order="mixed", trials=500, pulse=pulse_for(self.culture))
+        given = {name: value for name in ("order", "pulses", "trials") if (value := getattr(self, name)) is not None}
+        if self.protocol is None:
+            return replace(usual, **given)
+        if given:
+            options = ", ".join(f"--{name}" for name in given)
+            raise InvalidArgument(f"--protocol: expected it alone, got {options} too; put them in the file")
+        return read_protocol(self.protocol, usual)
 
     def _report(self, ran: LiveRun) -> None:
         from animat.execution.training import as_range

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -60,21 +61,10 @@ class Record(FolderCommand):
         from animat.cultures.series import record_series
         from animat.cultures.under_way import INTERRUPTED
         from animat.progress import Bar
-        from animat.recordings.reading import read_recording, read_recordings
+        from animat.recordings.reading import read_recordings
 
         # Before any device is powered.
-        for option, some, kind, value in (
-            ("--recordings", "some", "replay", len(self.recordings) or None),
-            ("--selection", "a file of electrodes", "maxone", self.selection),
-        ):
-            if (self.culture == kind) != (value is not None):
-                expected, got = (some, "none") if value is None else ("none", value)
-                raise InvalidArgument(f"{option}: expected {expected} for --culture {self.culture}, got {got}")
-        options = [f"--{name}" for name in _PRESENTED if getattr(self, name) is not None]
-        if self.protocol is not None and self.paper:
-            raise InvalidArgument("--protocol, --paper: expected one of them, as each is a protocol, got both")
-        if options and self.protocol is not None:
-            raise InvalidArgument(f"--protocol: expected it alone, got {', '.join(options)} too; put them in the file")
+        self._check_options()
         protocol = self._protocol()
         if self.protocol is not None:
             _warn_too_fast(protocol)
@@ -86,11 +76,10 @@ class Record(FolderCommand):
             )
         _expect_no_others(self.out)
         before, cut_short = set(self.out.glob("*")), set((self.out / INTERRUPTED).glob("*"))
+        is_device = self.culture in ("cl1", "maxone")
         with Bar("recording") as progress:
             recordings = read_recordings(self.recordings) if self.recordings else []
             sessions = (15 if self.paper else 2) if self.sessions is None else self.sessions
-
-            is_device = self.culture in ("cl1", "maxone")
 
             def planned(culture: Culture) -> Protocol:
                 protocol = self._protocol(len(culture.patterns))
@@ -116,15 +105,27 @@ class Record(FolderCommand):
         files = series.files
         for file in sorted(set((self.out / INTERRUPTED).glob("*")) - cut_short):
             print(f"what a run that was killed had recorded is in {file}", file=sys.stderr)
-        for file in files if is_device else ():
-            if file not in before:
-                for finding in read_recording(file).findings:
-                    print(f"{file.name}: {finding.severity}: {finding.message}", file=sys.stderr)
+        if is_device:
+            _print_findings(file for file in files if file not in before)
         existed = "; all existed already" if files and before.issuperset(self.out.glob("*")) else ""
         print(f"{counted(len(files), 'recording')} in {self.out}{existed}")
         if protocol.places:
             print("each place is a condition; --conditions frequency pools the places")
         return {"recordings": [str(file) for file in files]}
+
+    def _check_options(self) -> None:
+        for option, some, kind, value in (
+            ("--recordings", "some", "replay", len(self.recordings) or None),
+            ("--selection", "a file of electrodes", "maxone", self.selection),
+        ):
+            if (self.culture == kind) != (value is not None):
+                expected, got = (some, "none") if value is None else ("none", value)
+                raise InvalidArgument(f"{option}: expected {expected} for --culture {self.culture}, got {got}")
+        options = [f"--{name}" for name in _PRESENTED if getattr(self, name) is not None]
+        if self.protocol is not None and self.paper:
+            raise InvalidArgument("--protocol, --paper: expected one of them, as each is a protocol, got both")
+        if options and self.protocol is not None:
+            raise InvalidArgument(f"--protocol: expected it alone, got {', '.join(options)} too; put them in the file")
 
     def _protocol(self, patterns: int = 100) -> Protocol:
         """The protocol of the options, with the usual values for the culture's kind and number of patterns."""
@@ -154,6 +155,15 @@ def _expect_no_others(folder: Path) -> None:
     if others:
         got = some_of(others, 3)
         raise Mismatch(f"{folder}: expected only recordings of this series, got {got}; choose another --out")
+
+
+def _print_findings(files: Iterable[Path]) -> None:
+    """Print what is found on recordings of a device, which cannot be repeated."""
+    from animat.recordings.reading import read_recording
+
+    for file in files:
+        for finding in read_recording(file).findings:
+            print(f"{file.name}: {finding.severity}: {finding.message}", file=sys.stderr)
 
 
 def _plan(protocol: Protocol, sessions: int, interval_min: float) -> str:

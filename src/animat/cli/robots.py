@@ -56,7 +56,7 @@ def _describe(name: str) -> dict[str, Any]:
     robot = robot_for(name)
     lacks, parameters = lacking(robot), robot_to_dict(robot)["parameters"]
     if isinstance(robot, GymnasiumRobot):
-        # Its others are what was found in the environment.
+        # Its other parameters were found by inspecting the environment.
         parameters = {"episode_limit": robot.episode_limit, **dict(robot.settings)}
     return {
         "is": (type(robot).__doc__ or "").strip().partition("\n")[0],

@@ -103,7 +103,7 @@ class Train(SimulatorOptions, JobOptions):
         was_finished = is_finished(training, self.out)
         if timeline is not None:
             print(_controllability(timeline))
-        # A resumed training has reported it before.
+        # Not for a resumed training, which has already reported it.
         random = None if (self.out / MANIFEST).exists() else _random_return(training, timeline)
         with self.executing("training") as execution, board as on_row:
             trained = train(
@@ -130,7 +130,7 @@ class Train(SimulatorOptions, JobOptions):
         try:
             robot = robot_for(self.robot, self.goal, **parameters)
         except InvalidArgument as error:
-            # The message about an unknown robot begins otherwise.
+            # Only messages about its parameters begin with the robot's name.
             if not parameters or not str(error).startswith(f"{self.robot}: "):
                 raise
             raise InvalidArgument(f"--parameters: {error}") from error

@@ -53,11 +53,11 @@ class AdaptiveThresholds:
         self._recorded, self._added = recorded, np.zeros(len(self._kept), np.int64)
         self._latest, self._weights = self._means(), np.ones(len(self._kept))
 
-    def add(self, condition: int, came: HistoryState, read_hz: Float64[np.ndarray, "*readouts"]) -> None:
-        """Add a new non-burst response to a condition; `came`: the history state when its trial came."""
+    def add(self, condition: int, at_trial: HistoryState, read_hz: Float64[np.ndarray, "*readouts"]) -> None:
+        """Add a new non-burst response to a condition, with the history state at its trial."""
         row = self._first[condition] + self._added[condition] % self._kept[condition]
         self._hz[row] = read_hz
-        self._ranks[row] = rank = self._recorded.of_response(came, read_hz)
+        self._ranks[row] = rank = self._recorded.of_response(at_trial, read_hz)
         self._latest[condition] += (rank - self._latest[condition]) / LATEST
         self._added[condition] += 1
         self._weights *= 1 - 1 / (LATEST * len(self._weights))

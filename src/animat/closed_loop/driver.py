@@ -26,6 +26,7 @@ from animat.coding.encoder import Dealer
 from animat.cultures.base import Culture
 from animat.cultures.budget import Account
 from animat.cultures.failures import describe_error
+from animat.cultures.observed import Observed
 from animat.errors import AnimatError, BudgetSpent
 from animat.evaluation.controllers import Controller, begun
 from animat.neurons.history_tracker import HistoryState
@@ -74,7 +75,7 @@ class Driver:
         self._channels, self._rate_hz = culture.channels, culture.sampling_rate_hz
         # A device keeps its own time, from which the machine's clock drifts away.
         self._is_held_back = loop.real_time and culture.device is None
-        # The grid and the rounding to samples move a pulse by half a step each.
+        # Not late within rounding: the grid of ticks and that of samples each move a pulse by up to half a step.
         self._least_late_s = max(TICK_S, (TICK_S + 1 / self._rate_hz) / 2) + 1e-9
         self._adaptive = None if loop.adaptive_from is None else AdaptiveThresholds(loop.adaptive_from)
         self._percentiles = loop.percentiles
@@ -120,7 +121,7 @@ class Driver:
         self._last_command = 0.0 if (n := loop.robot.n_commands) == 1 else (0.0,) * n
         for rounds in loop.rounds_before(episode, is_silent=agent.delivery == "silent"):
             self._warm_up(agent, episode, rounds)
-        controller = self._answer_of(agent.name, "controller", lambda: begun(agent.acting(turn)))
+        controller = self._ask(agent.name, "controller", lambda: begun(agent.acting(turn)))
         remembering = loop.remembering if agent.sees_neurons(turn) else None
         source, conditions = list[int](), list[int]()
         if agent.delivery == "yoked":
@@ -150,7 +151,7 @@ class Driver:
 
     def _start(self, episode: int, turn: int) -> Float64[np.ndarray, " observations"]:
         """Start the robot: all agents of a round have the same start."""
-        observation = self._answer_of("the robot", "robot", lambda: self._runner.reset(turn))
+        observation = self._ask("the robot", "robot", lambda: self._runner.reset(turn))
         if not np.all(np.isfinite(observation)):
             raise Stop(Ending("robot", f"the robot starts at {observation.tolist()}"))
         self.records.append(Record({"kind": "start", "episode": episode, "observation": observation.tolist()}))
@@ -167,7 +168,7 @@ class Driver:
 
     def _choose(self, agent: Agent, controller: Controller, seen: Float64[np.ndarray, " observed"]) -> int:
         n = len(self.loop.conditions)
-        chosen = self._answer_of(agent.name, "controller", lambda: operator.index(controller.act(seen, self._rng)))
+        chosen = self._ask(agent.name, "controller", lambda: operator.index(controller.act(seen, self._rng)))
         if not 0 <= chosen < n:
             raise Stop(Ending("controller", f"{agent.name} chose {chosen}: expected a condition from 0 to {n - 1}"))
         return chosen
@@ -178,33 +179,23 @@ class Driver:
         frequency_hz = self._dealer.frequency_hz(delivered)
         due_s = self._last_pulse_s + 1 / frequency_hz
         since_s, times_s = self._times(due_s, frequency_hz)
-        stimuli: list[Stimulus] = []
-        if agent.delivery != "silent" or is_warm_up:
-            stimuli = [
-                Stimulus(float(t), target.electrodes, loop.pulse, frequency_hz, target.pattern, self._n_presented)
-                for t, target in zip(times_s, self._dealer.targets(delivered), strict=True)
-            ]
+        is_stimulated = agent.delivery != "silent" or is_warm_up
+        stimuli = self._stimuli(delivered, times_s, frequency_hz) if is_stimulated else []
         # Two samples longer than the window, so that a spike at its very end is not left to the next stretch.
         duration_s = float(times_s[-1]) + loop.window_ms[1] * 1e-3 + 2 / self._rate_hz
         decided_s = self.clock.now_s() - self._data_at_s
         stretch = self._observe(stimuli, duration_s, since_s)
         pulse_time_s = stretch.stimulus_time_s if stimuli else self._on_samples(since_s - self._zero_s + times_s)
         after_s = pulse_time_s[-1:]
-        # Lateness of the real times; where nothing is delivered, no pulse is late.
-        due_at_s = due_s - self._zero_s + np.arange(loop.pulses) / frequency_hz
-        given = [i for i, stimulus in enumerate(stimuli) if not stimulus.is_rest]
-        late_s = float(np.max((pulse_time_s - due_at_s)[given], initial=0.0))
-        late_s = late_s if late_s > self._least_late_s else 0.0
+        late_s = self._late_s(stimuli, pulse_time_s, due_s, frequency_hz)
         drawn_from = None if is_warm_up else agent.drawn_from
         x_hz, response = read_response(loop, drawn_from, stretch, self._members, after_s, self._rng)
         is_burst = response["is_burst"]
         self._last_pulse_s = self._zero_s + float(after_s[0])
         again = is_burst and loop.on_burst == "repeat" and repeats < loop.most_repeats and not is_warm_up
-        came = self._remembered
-        if loop.history is not None and stimuli:
-            is_rested = bool(pulse_time_s[0] - came.at_s > SILENCE_S)
-            came = loop.history.when(came, float(after_s[0]), is_rested=is_rested)
-            self._remembered = loop.history.after(came, delivered, response["rate_hz"], is_burst=is_burst)
+        at_trial = self._remembered
+        if stimuli:
+            at_trial = self._remember(delivered, pulse_time_s, response["rate_hz"], is_burst=is_burst)
         tick = Tick(
             number=self._n_presented,
             agent=agent.name,
@@ -232,7 +223,7 @@ class Driver:
             if tick.handled == "unfinished":
                 tick = replace(tick, **self._move(agent, x_hz, is_burst, iteration))
             if self._adaptive is not None and stimuli and (agent.calibrates or is_warm_up) and not is_burst:
-                self._adaptive.add(delivered, came, np.asarray(x_hz))
+                self._adaptive.add(delivered, at_trial, np.asarray(x_hz))
                 self._percentiles = self._adaptive.percentiles()
                 adapted["percentiles_hz"] = self._percentiles.tolist()
         finally:
@@ -240,6 +231,40 @@ class Driver:
             self.records.append(record._replace(fields={**record.fields, "tick": vars(tick), **adapted}))
             self.unfinished = None
         return tick
+
+    def _stimuli(self, condition: int, times_s: Float64[np.ndarray, " pulses"], frequency_hz: float) -> list[Stimulus]:
+        """The stimuli of a trial, on the next patterns of the deck."""
+        return [
+            Stimulus(float(t), target.electrodes, self.loop.pulse, frequency_hz, target.pattern, self._n_presented)
+            for t, target in zip(times_s, self._dealer.targets(condition), strict=True)
+        ]
+
+    def _late_s(
+        self,
+        stimuli: Sequence[Stimulus],
+        pulse_time_s: Float64[np.ndarray, " pulses"],
+        due_s: float,
+        frequency_hz: float,
+    ) -> float:
+        """How late the latest pulse of a trial came, whose first one was due at `due_s`; 0 within rounding.
+
+        Where nothing is delivered, no pulse is late.
+        """
+        due_at_s = due_s - self._zero_s + np.arange(self.loop.pulses) / frequency_hz
+        given = [i for i, stimulus in enumerate(stimuli) if not stimulus.is_rest]
+        late_s = float(np.max((pulse_time_s - due_at_s)[given], initial=0.0))
+        return late_s if late_s > self._least_late_s else 0.0
+
+    def _remember(
+        self, condition: int, pulse_time_s: Float64[np.ndarray, " pulses"], rate_hz: Any, *, is_burst: bool
+    ) -> HistoryState:
+        """Update the history state by a response; returns the state at its trial."""
+        at_trial, history = self._remembered, self.loop.history
+        if history is not None:
+            is_rested = bool(pulse_time_s[0] - at_trial.at_s > SILENCE_S)
+            at_trial = history.when(at_trial, float(pulse_time_s[-1]), is_rested=is_rested)
+            self._remembered = history.after(at_trial, condition, rate_hz, is_burst=is_burst)
+        return at_trial
 
     def _move(
         self, agent: Agent, x_hz: Float64[np.ndarray, "*readouts"], is_burst: bool, iteration: int
@@ -251,9 +276,9 @@ class Driver:
             command = self._decoder.command(np.asarray(x_hz, np.float32)[()], self._percentiles)
             command = -command if agent.is_turned_round else command
             self._last_command = tuple(command.tolist()) if np.ndim(command) else float(command)
-        moved = self._answer_of("the robot", "robot", lambda: self._runner.step(self._last_command))
+        moved = self._ask("the robot", "robot", lambda: self._runner.step(self._last_command))
         if iteration + 1 == agent.switch_at and not moved.terminated:
-            other = self._answer_of("the robot", "robot", lambda: self._runner.switch_goal(self._n_presented))
+            other = self._ask("the robot", "robot", lambda: self._runner.switch_goal(self._n_presented))
             moved = moved._replace(observation=other)
         if not (np.isfinite(moved.reward) and np.all(np.isfinite(moved.observation))):
             raise Stop(Ending("robot", f"the robot returned {moved.observation.tolist()} with reward {moved.reward:g}"))
@@ -285,29 +310,9 @@ class Driver:
             raise Stop(Ending("person", "stopped by a person"))
         if stopped := self.stopped_by_file():
             raise Stop(stopped)
-        culture, account = self.culture, self.account
-        try:
-            account.check(stimuli)
-        except BudgetSpent as spent:
-            raise Stop(Ending("budget", str(spent))) from spent
         number = self._n_stretches
         request = request_fields(number, since_s - self._zero_s, stimuli)
-        self._n_stretches += 1
-        # Spent before the answer: unanswered pulses may have been delivered.
-        account.spend(stimuli)
-        self.request = request
-        self._set_deadline("the culture", duration_s)
-        try:
-            observed = culture.deliver(stimuli, duration_s, since_s=since_s)
-        except Exception as error:
-            # The error says so, not the culture's own count, which may include another thread's stimuli.
-            is_admitted = not isinstance(error, AnimatError) or error.is_admitted
-            if not is_admitted:
-                account.take_back(stimuli)
-            # If a person stopped the culture, that ended the session, not the refusal that follows.
-            ending = ending_of(error, culture, self.is_stopped)
-            self._log_fault(ending, request, is_admitted=is_admitted)
-            raise Stop(ending) from error
+        observed = self._delivered(stimuli, duration_s, since_s, request)
         fault = check_answer(
             observed,
             requested_s=np.array([stimulus.time_s for stimulus in stimuli], np.float64),
@@ -335,18 +340,44 @@ class Driver:
         self._data_at_s = self.clock.now_s()
         return stretch
 
+    def _delivered(
+        self, stimuli: Sequence[Stimulus], duration_s: float, since_s: float, request: dict[str, Any]
+    ) -> Observed:
+        """What the culture answers, within the budget; if it fails, this is logged, and the loop ends."""
+        culture, account = self.culture, self.account
+        try:
+            account.check(stimuli)
+        except BudgetSpent as spent:
+            raise Stop(Ending("budget", str(spent))) from spent
+        self._n_stretches += 1
+        # Spent before the answer: unanswered pulses may have been delivered.
+        account.spend(stimuli)
+        self.request = request
+        self._set_deadline("the culture", duration_s)
+        try:
+            return culture.deliver(stimuli, duration_s, since_s=since_s)
+        except Exception as error:
+            # By the error itself: the culture's count may include another thread's stimuli.
+            is_admitted = not isinstance(error, AnimatError) or error.is_admitted
+            if not is_admitted:
+                account.take_back(stimuli)
+            # If a person stopped the culture, that ended the session, not the refusal that follows.
+            ending = ending_of(error, culture, self.is_stopped)
+            self._log_fault(ending, request, is_admitted=is_admitted)
+            raise Stop(ending) from error
+
     def _log_fault(self, ending: Ending, request: dict[str, Any], **more: Any) -> None:
         """Log a request that has no usable answer."""
         fields = {"kind": "event", "what": ending.by, "message": ending.message, **request, **more}
         self.records.append(Record(fields))
 
-    def _answer_of(self, who: str, by: EndedBy, ask: Callable[[], T]) -> T:
+    def _ask(self, who: str, by: EndedBy, ask: Callable[[], T]) -> T:
         """The answer of the robot or an agent, by a deadline; whatever it raises ends the session."""
         self._set_deadline(who)
         try:
             return ask()
         except BaseException as error:
-            # Libraries exit, and raise what Ctrl-C and cancelled tasks do, too.
+            # Also SystemExit, KeyboardInterrupt and CancelledError, which a user's code or its libraries may raise.
             raise Stop(Ending(by, f"{who} raised {describe_error(error)}")) from error
 
     def _set_deadline(self, who: str, in_s: float = 0.0) -> None:

@@ -62,7 +62,7 @@ class LogWriter:
         with as_invalid_file(path, "cannot be written"), ExitStack() as stack:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._file = os.open(path, os.O_CREAT | os.O_EXCL | os.O_APPEND | os.O_WRONLY, 0o666)
-            # Without its first record it would be no session's, and in the way of the next.
+            # A file without its first record is not a log, and would prevent the next session.
             stack.callback(path.unlink, missing_ok=True)
             stack.callback(self.close)
             # Nobody recovers the session while it is running.
@@ -88,7 +88,7 @@ class LogWriter:
     def sync(self) -> None:
         """Flush the file to disk, against a power cut; raises OSError too if it was removed, which no write would."""
         os.fsync(self._file)
-        # Some file systems count no links.
+        # On some file systems the number of links is always 0.
         if os.fstat(self._file).st_nlink == 0 and not self._path.exists():
             raise FileNotFoundError(errno.ENOENT, "it was removed")
 

@@ -39,7 +39,7 @@ def _compiled(robot: Robot[Any]) -> tuple[Callable[..., Any], ...]:
 
     def stepped(uniforms: Any, state: Any, u: Any) -> tuple[Any, Any]:
         after, reward, terminated = robot.advance(uniforms, state, u)
-        # One array: to wait for each of three took longer than the step itself.
+        # One array: waiting for each of three takes longer than the step itself.
         return after, jnp.concatenate([jnp.stack([reward, terminated]), robot.observe(after)])
 
     def started(key: Any, number: int) -> tuple[Any, Any]:

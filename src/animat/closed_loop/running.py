@@ -195,7 +195,7 @@ class _Supervisor:
                     # Why the loop ended counts; `_finish` tries again, and says what is lost.
                     break
                 return Ending("disk", f"the log cannot be written: {error.strerror or error}")
-            if thread.is_alive() and (stopped := self._stopped() or driver.stopped_by_file()):
+            if thread.is_alive() and (stopped := self._stopped_by_person() or driver.stopped_by_file()):
                 # The loop checks before its next trial; do not wait for the pulses of the current one.
                 return stopped
             by_s, who = driver.deadline
@@ -242,7 +242,7 @@ class _Supervisor:
             message = f"{ending.message}; BUT {self._not_halted}: make sure that the device delivers no more pulses"
             ending = replace(ending, message=message)
         left_out: dict[str, int] = {}
-        # A culture that is gone may not be able to count.
+        # A culture that has lost its device may fail here.
         with suppress(Exception):
             left_out = Counter(self._culture.left_out) - Counter(self._left_out)
         try:
@@ -268,10 +268,10 @@ class _Supervisor:
         self._by_person = self._by_person or (time.monotonic(), ending)
         self._halt(ending)
 
-    def _stopped(self) -> Ending | None:
+    def _stopped_by_person(self) -> Ending | None:
         """The ending if a person stopped the loop some time ago, and an agent or the robot keeps it from ending."""
         since_s, ending = self._by_person or (math.inf, None)
-        # What the culture answers to the last pulses is waited for.
+        # The culture's answer to the last pulses is waited for; only the robot and agents are not.
         is_theirs = self._driver.deadline[1] not in ("the culture", "the clock")
         return ending if is_theirs and time.monotonic() > since_s + _UNANSWERED_S else None
 
@@ -318,7 +318,7 @@ def _header(driver: Driver, predicted: Mapping[str, Interval]) -> dict[str, Any]
 
 
 def _put_sources_first(turns: list[int], agents: Sequence[Agent]) -> list[int]:
-    """Swap an agent's first yoked episode with the first that it could repeat, if that comes later."""
+    """Swap an agent's first yoked episode with the first one that it can repeat, if that comes later."""
     turns = list(turns)
     for number, agent in enumerate(agents):
         if agent.delivery != "yoked" or number not in turns:

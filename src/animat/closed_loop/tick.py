@@ -17,7 +17,7 @@ STOP_FILE = "STOP"
 
 @dataclass(frozen=True, kw_only=True)
 class Tick:
-    """One presentation, its response, and the result. Times are in seconds on the session's clock.
+    """One trial, its response, and the result. Times are in seconds on the session's clock.
 
     Attributes:
         number, episode: in the session, from 0.

@@ -46,7 +46,7 @@ def real_time_priority(*, inherited: bool) -> Iterator[None]:
     finally:
         if before is not None:
             policy, parameters = before
-            # Without root the reset on fork cannot be taken back, which does no harm.
+            # Only root may clear the flag for reset on fork; it does no harm if it stays.
             with contextlib.suppress(OSError):
                 os.sched_setscheduler(0, policy | os.SCHED_RESET_ON_FORK, parameters)
                 os.sched_setscheduler(0, policy, parameters)

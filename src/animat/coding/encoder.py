@@ -121,7 +121,7 @@ class _Deck:
         self._left: list[Target] = []
 
     def hand(self, n: int, but: Iterable[Target] = ()) -> list[Target]:
-        """Draw n, different from each other and from those in `but` as long as the deck has such."""
+        """Draw n targets, different from each other and from those in `but` as far as the deck allows."""
         hand: list[Target] = []
         avoided = list(but)
         while len(hand) < n:

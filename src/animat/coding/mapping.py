@@ -86,7 +86,7 @@ class Thresholds(Mapping):
     def command(self, x: Numbers, percentiles: Numbers) -> Numbers:
         """The level of the interval between thresholds in which `x` lies (see `Mapping.command`)."""
         half = (self.count + 1) // 2
-        # Start with a whole number: the sum of two numpy booleans would be a boolean.
+        # Starts with a whole number, as numpy booleans would add up to a boolean.
         n_passed = sum((x >= percentiles[i] for i in self.percentile_indices), start=0)
         # The middle threshold is a step of two, over the zero. Dividing whole numbers rounds each level to the nearest
         # float, so numpy and JAX agree.

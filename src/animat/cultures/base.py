@@ -137,15 +137,7 @@ class Culture(Openable):
             with as_device_failure(self.name, "deliver"), turns as guard:
                 now_s = seconds("now_s", self.now_s)
                 if since_s is not None and since_s != now_s:
-                    since_s = seconds("since_s", since_s)
-                    if not since_s <= now_s:
-                        expected = f"a reading of the clock, which is at {now_s:g} s"
-                        raise InvalidArgument(f"since_s: expected {expected}, got {since_s}")
-                    # All are moved equally, so that intervals stay as requested; what is overdue begins now. Times
-                    # below 0 are left to the guard.
-                    passed_s = min(now_s - since_s, max(0.0, stimuli[0].time_s) if stimuli else duration_s)
-                    stimuli = [replace(stimulus, time_s=stimulus.time_s - passed_s) for stimulus in stimuli]
-                    duration_s -= passed_s
+                    stimuli, duration_s = _from_now(stimuli, duration_s, seconds("since_s", since_s), now_s)
                 # Rests go neither to the guard nor to the backend.
                 pulses = [stimulus for stimulus in stimuli if not stimulus.is_rest]
                 if stimuli and not pulses:
@@ -155,7 +147,7 @@ class Culture(Openable):
                     observed = self._deliver(admitted, duration_s)
                 except BaseException:
                     if isinstance(self, ComputedCulture):
-                        # What was to come does not come; a device may still deliver it.
+                        # A computed culture delivers nothing more; a device may still deliver the rest.
                         guard.interrupt(self.now_s)
                     raise
                 return with_rests(observed, stimuli, now_s)
@@ -244,7 +236,7 @@ class Culture(Openable):
         """
         schedule, progress = self.schedule(protocol, seed), progress or Silent()
         provenance = {**self.provenance, "protocol_seed": str(seed)}
-        # Other recordings are the same whenever they are made.
+        # Recordings of computed cultures have no date, as they do not depend on when they are made.
         date = None if self.device is None else datetime.now(UTC).replace(microsecond=0)
         if date is not None:
             provenance["recorded_at"] = date.isoformat()
@@ -316,6 +308,21 @@ def _plain_request(stimuli: Iterable[Stimulus], duration_s: float) -> tuple[Sequ
     if has_rests and not all(before <= after for before, after in pairwise([0.0, *times_s])):
         raise InvalidArgument(f"stimuli: expected times from 0 s in ascending order, got {times_s[:5]}")
     return stimuli, duration_s
+
+
+def _from_now(
+    stimuli: Sequence[Stimulus], duration_s: float, since_s: float, now_s: float
+) -> tuple[Sequence[Stimulus], float]:
+    """A request whose times count from `since_s`, as one from now; InvalidArgument if that is later.
+
+    All stimuli are moved equally, so that intervals stay as requested; what is overdue begins now. Times below 0 are
+    left to the guard.
+    """
+    if not since_s <= now_s:
+        expected = f"a reading of the clock, which is at {now_s:g} s"
+        raise InvalidArgument(f"since_s: expected {expected}, got {since_s}")
+    passed_s = min(now_s - since_s, max(0.0, stimuli[0].time_s) if stimuli else duration_s)
+    return [replace(stimulus, time_s=stimulus.time_s - passed_s) for stimulus in stimuli], duration_s - passed_s
 
 
 def _plain_duration(duration_s: float) -> float:

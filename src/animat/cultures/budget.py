@@ -55,7 +55,7 @@ class Account:
 
     def check(self, stimuli: Sequence[Stimulus]) -> None:
         """Raise `BudgetSpent`, naming what would be exceeded, unless the budget covers these stimuli too."""
-        self.check_number(_pulses(stimuli))
+        self.check_number(_count_pulses(stimuli))
         most = self.budget.pulses_per_electrode
         if most is None:
             return
@@ -72,15 +72,15 @@ class Account:
 
     def spend(self, stimuli: Sequence[Stimulus]) -> None:
         """Enter stimuli as delivered."""
-        self.pulses += _pulses(stimuli)
-        # One by one: building a Counter first took five times as long, before every pulse of a closed loop.
+        self.pulses += _count_pulses(stimuli)
+        # Without a Counter of the stimuli, which takes five times as long, before every pulse of a closed loop.
         for stimulus in stimuli:
             for electrode in stimulus.electrodes:
                 self._on[electrode] += 1
 
     def take_back(self, stimuli: Sequence[Stimulus]) -> None:
         """Enter stimuli as not delivered after all: the culture refused them."""
-        self.pulses -= _pulses(stimuli)
+        self.pulses -= _count_pulses(stimuli)
         self._on -= _counted(stimuli)
 
     def to_dict(self) -> dict[str, Any]:
@@ -135,7 +135,7 @@ class _HandedOver:
         self._progress.update(done, total, note)
 
 
-def _pulses(stimuli: Sequence[Stimulus]) -> int:
+def _count_pulses(stimuli: Sequence[Stimulus]) -> int:
     """How many of the stimuli are delivered, rests aside."""
     return sum(not stimulus.is_rest for stimulus in stimuli)
 

@@ -18,12 +18,12 @@ _LAST = "held_last_by"
 
 
 def of_the_machine(device: str) -> Path:
-    """The folder that represents a device of which the machine has one."""
+    """The folder that stands for a device of this machine, shared by all programs."""
     return MACHINE / f"animat-{device}"
 
 
 def of_the_program(device: str) -> Path:
-    """The folder that represents a simulated device of which each program has its own; removed when it ends."""
+    """The folder that stands for a simulated device of this program alone; removed when the program ends."""
     return Path(_own_folder().name) / device
 
 
@@ -32,7 +32,7 @@ def hold(device: Path, holder: str) -> Iterator[bool]:
     """Hold a device exclusively until the block or the process ends; yields whether another `holder` had it last."""
     with ExitStack() as stack:
         try:
-            # In a world-writable folder another user could point a link at one of ours.
+            # Refused, as the parent is world-writable: another user could have made it a link to one of our folders.
             if device.is_symlink() or (device.exists() and not device.is_dir()):
                 raise DeviceFailed(f"{device.name}: expected a folder as its lock, got another file: remove {device}")
             stack.enter_context(exclusive_lock(device))
@@ -45,10 +45,10 @@ def hold(device: Path, holder: str) -> Iterator[bool]:
         except Mismatch as error:
             held = "one that another culture object holds, in this program or another: close it there first"
             raise DeviceFailed(f"{device.name}: expected a device that is not in use, got {held}") from error
-        yield _last(device, holder) != holder
+        yield _exchange_holder(device, holder) != holder
 
 
-def _last(device: Path, holder: str) -> str:
+def _exchange_holder(device: Path, holder: str) -> str:
     """The last holder, or `holder` if there was none; records `holder` as the last."""
     note = device / _LAST
     try:

@@ -139,7 +139,7 @@ _IS_AS_TIGHT: dict[str, Callable[[Any, Any], bool]] = {
     **dict.fromkeys(("stimuli_per_electrode_s", "stimuli_per_s"), operator.le),
     **dict.fromkeys(("alternates", "interval_us", "gap_us"), operator.ge),
     "phase_step_us": is_multiple,
-    # The device's own step or 0, which stands for it: with any other, the guard would check a pulse never delivered.
+    # Only the device's own step, or 0 for it: with another, the checked pulse would not be the delivered one.
     "amplitude_step": lambda ours, device: ours in (0.0, device),
 }
 """For each limit, whether a requested value is at least as tight as the device's; a limit missing here is an error."""

@@ -58,7 +58,7 @@ def observed_in_frames(
 
 
 def following(before: Observed, observed: Observed) -> tuple[Observed, float]:
-    """An observation that begins where the one before it ended, and the seconds in between, which nobody observed."""
+    """An observation, extended back to the end of the one before it, and the unobserved seconds in between."""
     missed_s = max(0.0, observed.start_s - before.start_s - before.duration_s)
     spikes = Spikes(observed.spikes.time_s + missed_s, observed.spikes.channel)
     start_s, duration_s = observed.start_s - missed_s, observed.duration_s + missed_s

@@ -83,7 +83,7 @@ class Openable(abc.ABC):
 
     def __init__(self, limits: Limits | None = None) -> None:
         self._asked_limits = None if limits is None else plain_limits(limits)
-        # Names that no subclass takes by accident.
+        # Mangled names, which no subclass can use by accident.
         self.__turns: Turns | None = None
         # Covers all sessions: closing and reopening must not circumvent a rate limit.
         self.__history = History()
@@ -166,7 +166,7 @@ class Openable(abc.ABC):
                     limits = self.limits
                     plain_limits(self._asked_limits or limits).check_within(self.device_limits)
                     if is_handed_over:
-                        # What the other delivered is unknown here: wait as long as any limit on pace looks back.
+                        # What the other program delivered is unknown: wait as long as any limit on pace looks back.
                         self._rest(max(1.0, limits.interval_us * 1e-6, limits.gap_us * 1e-6))
                     now_s = seconds("now_s", self.now_s)
                     self.__turns = Turns(Guard(limits, self.stimulation_electrodes, self.__history, now_s))

@@ -121,13 +121,13 @@ class ReplayCulture(ComputedCulture):
         numbers = np.array([stimulus.presentation for stimulus in admitted.stimuli])
         # All answers are found before anything changes: a request with an unrecorded condition must leave no trace.
         answers = [
-            (start_ns + round(stimulus.time_s * NS), self._pool(stimulus, is_last))
+            (start_ns + round(stimulus.time_s * NS), self._candidates(stimulus, is_last))
             for stimulus, is_last in zip(admitted.stimuli, is_last_of(numbers), strict=True)
         ]
         for time_ns, (recording, pool) in answers:
             chosen = np.random.default_rng([self._seed, 13, self._answered]).integers(len(pool))
             self._answered += 1
-            self._answer(time_ns, recording, int(pool[chosen]))
+            self._insert_response(time_ns, recording, int(pool[chosen]))
         known = int(np.searchsorted(self._pending_ns, end_ns))
         spikes = Spikes((self._pending_ns[:known] - start_ns) / NS, self._pending_channel[:known])
         self._pending_ns, self._pending_channel = self._pending_ns[known:], self._pending_channel[known:]
@@ -135,7 +135,7 @@ class ReplayCulture(ComputedCulture):
         stimulus_s = np.array([time_ns - start_ns for time_ns, _ in answers], dtype=np.float64) / NS
         return Observed(self._zero_s + start_ns / NS, (end_ns - start_ns) / NS, spikes, stimulus_s)
 
-    def _pool(self, stimulus: Stimulus, is_last: bool) -> tuple[Recording, Int64[np.ndarray, " pulses"]]:
+    def _candidates(self, stimulus: Stimulus, is_last: bool) -> tuple[Recording, Int64[np.ndarray, " pulses"]]:
         """The recorded pulses that may answer, and their recording."""
         minute = (self.now_s + stimulus.time_s) / 60
         row = max(0, sum(recording.start_min <= minute for recording in self._recordings) - 1)
@@ -160,7 +160,7 @@ class ReplayCulture(ComputedCulture):
             raise InvalidArgument(f"{expected}, got {stimulus.frequency_hz:g}: a replay cannot answer others")
         return recording, pool
 
-    def _answer(self, time_ns: int, recording: Recording, pulse: int) -> None:
+    def _insert_response(self, time_ns: int, recording: Recording, pulse: int) -> None:
         """Insert the spikes that followed a recorded pulse after this one, replacing those still pending."""
         since_s, *next_s = recording.stimuli.time_s[pulse : pulse + 2].tolist()
         first, last = np.searchsorted(recording.spike_times_s, [since_s, min([since_s + REACH_S, *next_s])])

@@ -65,19 +65,19 @@ class History:
     """
 
     def __init__(self) -> None:
-        # On each electrode, and on any of them as None.
+        # Of pulses on each electrode; the key None has those of all electrodes.
         self._starts_on: dict[int | None, list[int]] = defaultdict(list)
         self._seen_ns = 0
         self.busy_until_ns = -(2**63)
         """When the last stimulus ends; before any, too long ago for every gap."""
 
     def in_second_to(self, time_ns: int, electrode: int | None = None) -> int:
-        """Stimuli, on one electrode or on any, that began less than a second before a time not before the last."""
+        """How many stimuli, on one electrode or on any, began in the second before a time not before the last."""
         starts = self._starts_on.get(electrode, ())
         return len(starts) - bisect_right(starts, time_ns - NS)
 
     def last_on(self, electrode: int | None) -> int | None:
-        """When the last stimulus on an electrode, or on any, began, however long ago; None: there was none."""
+        """When the last stimulus on an electrode (None: on any) began; None if there was none."""
         starts = self._starts_on.get(electrode)
         return starts[-1] if starts else None
 

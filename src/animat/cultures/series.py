@@ -100,7 +100,7 @@ def record_series(
         n_patterns = len(culture.patterns) if virtual is None else virtual.n_patterns
         check_interval(protocol, sessions, interval_min, n_patterns)
         files, interval_s = [folder / recording_name(n * interval_min) for n in range(sessions)], 60 * interval_min
-        made = _made(folder, interval_min)
+        made = _existing_recordings(folder, interval_min)
         if virtual is not None:
             virtual.limits.check_pulse(protocol.pulse)
             _check_recordings(made, virtual, protocol, interval_s, seed)
@@ -122,11 +122,8 @@ def record_series(
             zero_s = _start_s(made, culture, protocol, interval_s)
         clear_leftovers(folder, "recording_*_min.nwb", STATE_FILE, SELECTION_FILE)
         follow = opened.enter_context(PartialRecording(folder, culture.device is not None))
-        if virtual is not None and not (recorded and (folder / SELECTION_FILE).exists()):
-            virtual.selection.save(folder / SELECTION_FILE)
-        if virtual is not None and not recorded:
-            # A run killed during the first recording needs no second scan.
-            virtual.save_state(folder / STATE_FILE, sessions=0)
+        if virtual is not None:
+            _save_beginning(virtual, folder, recorded)
         for session, file in enumerate(files[recorded:], recorded):
             due_s = zero_s + session * interval_s
             if (virtual is None and file.exists()) or culture.now_s >= due_s + interval_s:
@@ -136,13 +133,7 @@ def record_series(
             expect_writable(folder, room_bytes=room_bytes)
             part = Part(progress, session, 1, sessions, file.name)
             recording = culture.record(protocol, order_seed(seed, session), part, follow)
-            if not file.exists():
-                follow.finish(recording, partial(write_nwb, recording, file))
-            elif not read_recording(file).equals(recording):
-                remedy = "remove it, or choose another folder"
-                raise Mismatch(f"{file}: expected the same as when recorded again, got another recording: {remedy}")
-            else:
-                follow.remove()
+            _keep(recording, file, follow)
             if virtual is not None:
                 # After the recording, so that the state is never ahead of a missing recording.
                 virtual.save_state(folder / STATE_FILE, sessions=session + 1)
@@ -150,6 +141,25 @@ def record_series(
     existing = [file for file in files if file.exists()]
     progress.update(sessions, sessions, existing[-1].name if existing else "")
     return Series(existing, [session * interval_min for session, file in enumerate(files) if not file.exists()])
+
+
+def _save_beginning(culture: VirtualCulture, folder: Path, recorded: int) -> None:
+    """Save the electrodes and, before any recording, the state: a run killed during the first needs no second scan."""
+    if not (recorded and (folder / SELECTION_FILE).exists()):
+        culture.selection.save(folder / SELECTION_FILE)
+    if not recorded:
+        culture.save_state(folder / STATE_FILE, sessions=0)
+
+
+def _keep(recording: Recording, file: Path, follow: PartialRecording) -> None:
+    """Write a recording, or compare it with the file if it was recorded again."""
+    if not file.exists():
+        follow.finish(recording, partial(write_nwb, recording, file))
+    elif not read_recording(file).equals(recording):
+        remedy = "remove it, or choose another folder"
+        raise Mismatch(f"{file}: expected the same as when recorded again, got another recording: {remedy}")
+    else:
+        follow.remove()
 
 
 def order_seed(seed: int, session: int) -> int:
@@ -195,7 +205,7 @@ def room_bytes_of(protocol: Protocol, n_patterns: int | None = None) -> float:
     return _BYTES_PER_FILE + _BYTES_PER_MIN * minutes_of(protocol, n_patterns)
 
 
-def _made(folder: Path, interval_min: float) -> dict[int, Path]:
+def _existing_recordings(folder: Path, interval_min: float) -> dict[int, Path]:
     """The existing recordings by their place in the series; raises for one that has none, as of another interval."""
     made: dict[int, Path] = {}
     for file in folder.glob("recording_*_min.nwb"):
@@ -203,7 +213,7 @@ def _made(folder: Path, interval_min: float) -> dict[int, Path]:
         with suppress(ValueError, OverflowError):
             place = round(float(file.name.removeprefix("recording_").removesuffix("_min.nwb")) / interval_min)
         if place < 0 or recording_name(place * interval_min) != file.name:
-            raise _another(file, f"at a multiple of the interval, {interval_min:g} min, got one in between")
+            raise _mismatch(file, f"at a multiple of the interval, {interval_min:g} min, got one in between")
         made[place] = file
     return dict(sorted(made.items()))
 
@@ -216,7 +226,7 @@ def _check_recordings(
         provenance = culture.settings | {"protocol_seed": str(order_seed(seed, session))}
         start_min = _read_expected(file, provenance, protocol).start_min
         if abs(start_min * 60 - session * interval_s) > 1e-6:
-            raise _another(file, f"at {session * interval_s / 60:g} min, got one at {start_min:g} min")
+            raise _mismatch(file, f"at {session * interval_s / 60:g} min, got one at {start_min:g} min")
 
 
 def _start_s(made: Mapping[int, Path], culture: Culture, protocol: Protocol, interval_s: float) -> float:
@@ -227,22 +237,22 @@ def _start_s(made: Mapping[int, Path], culture: Culture, protocol: Protocol, int
         recording = _read_expected(file, provenance, protocol)
         for name in ("label", "electrode"):
             if getattr(recording.channels, name).tolist() != getattr(culture.channels, name).tolist():
-                raise _another(file, f"of this culture's channels, got others ({name}s differ)")
+                raise _mismatch(file, f"of this culture's channels, got others ({name}s differ)")
         # Places come from the protocol, and are not patterns.
         if not protocol.places and (strange := other_patterns(recording, culture)) is not None:
-            raise _another(file, f"with this culture's patterns, got others ({strange.value:g} of them)")
+            raise _mismatch(file, f"with this culture's patterns, got others ({strange.value:g} of them)")
         if zero_s is None:
             zero_s = 60 * recording.start_min - session * interval_s
         since_s = culture.now_s - 60 * recording.start_min
         if since_s < recording.duration_s:
             ended_min = recording.start_min + recording.duration_s / 60
             at = f"{culture.now_s / 60:.2f} min, got one at {recording.start_min:.2f} min, to {ended_min:.2f} min"
-            raise _another(file, f"before the culture's clock, which is at {at}: it was restarted, or is another's")
+            raise _mismatch(file, f"before the culture's clock, which is at {at}: it was restarted, or is another's")
         if culture.device is not None and recording.recorded_at is not None:
             passed_s = (datetime.now(UTC) - recording.recorded_at).total_seconds()
             if passed_s > since_s + 60 * RESTARTED_MIN:
                 passed = f"{since_s / 60:.0f} min ago by the culture's clock, got one of {passed_s / 60:.0f} min ago"
-                raise _another(file, f"{passed} by its date: the clock was restarted")
+                raise _mismatch(file, f"{passed} by its date: the clock was restarted")
     return culture.now_s if zero_s is None else zero_s
 
 
@@ -255,11 +265,11 @@ def _read_expected(file: Path, provenance: Mapping[str, str], protocol: Protocol
         found, wanted = {name: _parsed(recorded[name])} if name in recorded else {}, {name: _parsed(text)}
         # 25000 and 25000.0 are the same, as another version of a device's package may write it.
         if found != wanted and (difference := first_difference(found, wanted)):
-            raise _another(file, f"of the same culture and protocol, got another ({difference})")
+            raise _mismatch(file, f"of the same culture and protocol, got another ({difference})")
     return recording
 
 
-def _another(file: Path, difference: str) -> Mismatch:
+def _mismatch(file: Path, difference: str) -> Mismatch:
     return Mismatch(f"{file}: expected a recording {difference}: choose another folder")
 
 

@@ -132,7 +132,7 @@ def class_of(simulator: MemorySimulator, history: Float[Stored, "*histories 2"])
 
     Loads are not distinguished: each class has the loads that were recorded with such traces.
     """
-    ends, traces = to_jax(np.arange(1, CLASSES) / CLASSES), to_jax(_recorded(simulator)[:, 0])
+    ends, traces = to_jax(np.arange(1, CLASSES) / CLASSES), to_jax(_recorded_histories(simulator)[:, 0])
     return np.asarray(np.sum(np.asarray(history)[..., :1] >= np.asarray(jnp.quantile(traces, ends)), axis=-1))
 
 
@@ -147,7 +147,7 @@ def commands_after(environment: Environment[Any], simulator: Neurons) -> list[li
     if memory is None:
         return [[commands_of(environment, simulator)]]
     assert isinstance(animat, Animat)
-    levels, histories = _answers(animat, memory, _histories(memory))
+    levels, histories = _command_quantiles(animat, memory, _histories_of_classes(memory))
     levels, classes = np.asarray(levels, np.float64), class_of(memory, histories)
     if is_shuffled(environment):
         # The delivered condition does not depend on the choice: one action represents all.
@@ -164,15 +164,15 @@ def is_shuffled(environment: Environment[Any]) -> bool:
     return isinstance(unwrapped(environment, ShuffledDelivery), ShuffledDelivery)
 
 
-def _recorded(simulator: MemorySimulator) -> Float[np.ndarray, "responses 2"]:
+def _recorded_histories(simulator: MemorySimulator) -> Float[np.ndarray, "responses 2"]:
     """The histories of all recorded responses, sorted by trace."""
     histories = np.asarray(simulator.histories)[np.isfinite(np.asarray(simulator.before))]
     return np.asarray(histories[np.argsort(histories[:, 0], kind="stable")])
 
 
-def _histories(simulator: MemorySimulator) -> Float[np.ndarray, "classes histories 2"]:
+def _histories_of_classes(simulator: MemorySimulator) -> Float[np.ndarray, "classes histories 2"]:
     """A few histories of each class, evenly spaced in rank among the recorded ones."""
-    recorded = _recorded(simulator)
+    recorded = _recorded_histories(simulator)
     ends = np.searchsorted(class_of(simulator, recorded), np.arange(CLASSES + 1))
     within = (np.arange(_HISTORIES_PER_CLASS) + 0.5) / _HISTORIES_PER_CLASS
     # A class without recorded histories can only contain an episode's start; the nearest histories represent it.
@@ -181,7 +181,7 @@ def _histories(simulator: MemorySimulator) -> Float[np.ndarray, "classes histori
 
 
 @partial(jax.jit, static_argnums=0)
-def _answers(
+def _command_quantiles(
     environment: Animat[Any], simulator: MemorySimulator, history: Float[Array, "classes histories 2"]
 ) -> tuple[Float[Array, "classes conditions draws"], Float[Array, "classes conditions draws 2"]]:
     """The commands and the next histories, at evenly spaced quantiles of each condition after each history."""

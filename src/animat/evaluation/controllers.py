@@ -30,12 +30,12 @@ class Controller(Protocol):
 
 
 def acts(controller: object) -> bool:
-    """Whether it acts, or what it begins does."""
+    """Whether an object is a controller: it has a method `act`, or `begin`, which returns one for an episode."""
     return any(callable(getattr(controller, name, None)) for name in ("act", "begin"))
 
 
 def begun(controller: Controller) -> Controller:
-    """What acts in one episode: the controller itself, unless it remembers."""
+    """The controller of one episode: a new one from `begin` if it has this method, otherwise itself."""
     if not callable(begin := getattr(controller, "begin", None)):
         return controller
     acting: Controller = begin()

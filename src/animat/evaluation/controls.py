@@ -57,7 +57,7 @@ class Control:
         if self.is_turned_round or self.commands is not None:
             animat = wrappers.unwrapped(environment)
             assert isinstance(animat, Animat)
-            # A subclass of the user's may have more attributes.
+            # Not `replace`: a user's subclass of Animat may have further attributes.
             of = animat.robot, animat.mapping, animat.n_conditions
             changed: Animat[Any] = wrappers.ReversedMapping(*of)
             if self.commands is not None:
@@ -68,7 +68,7 @@ class Control:
         elif self.delivery == "yoked":
             environment = wrappers.YokedDelivery(environment)
         elif self.delivery == "silent" and simulator is not None:
-            # What is delivered makes no difference to neurons whose responses are drawn.
+            # Where responses are drawn at random, they do not depend on whether anything is delivered.
             simulator = indifferent(simulator) if self.is_drawn else silenced(simulator)
         if self.switch_at is not None:
             environment = wrappers.GoalSwitch(environment, self.switch_at)

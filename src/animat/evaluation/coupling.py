@@ -107,6 +107,22 @@ def best_coupling(
     size = n_commands * (len(seen) + 1)
     per_weight = max(8, -(-40 // size))
     near_heuristic = _near_heuristic(environment, simulator, seen, seed)
+
+    def last_generation(kind: Kind, draws: int, episodes: int, first: Any) -> Float64[np.ndarray, "actors weights"]:
+        search = differential_evolution(
+            lambda w: -mean_returns(actor(kind, w.T), EPISODES, episodes),
+            [(-LARGEST_WEIGHT, LARGEST_WEIGHT)] * size,
+            maxiter=GENERATIONS,
+            popsize=per_weight,
+            init=first,
+            tol=0.0,
+            rng=draws,
+            polish=False,
+            vectorized=True,
+            updating="deferred",
+        )
+        return search.population  # type: ignore[no-any-return]
+
     seeds = np.random.default_rng([seed, 31]).integers(2**31, size=(len(KINDS), RESTARTS, 2)).tolist()
     fresh = seeds[0][0][0] + 1
     best = []
@@ -117,19 +133,7 @@ def best_coupling(
             if restart and len(near_heuristic):
                 bounds, others = (-LARGEST_WEIGHT, LARGEST_WEIGHT), (per_weight * size - len(near_heuristic), size)
                 first = np.concatenate([near_heuristic, np.random.default_rng([draws, 1]).uniform(*bounds, others)])
-            search = differential_evolution(
-                lambda w, kind=kind, episodes=episodes: -mean_returns(actor(kind, w.T), EPISODES, episodes),
-                [(-LARGEST_WEIGHT, LARGEST_WEIGHT)] * size,
-                maxiter=GENERATIONS,
-                popsize=per_weight,
-                init=first,
-                tol=0.0,
-                rng=draws,
-                polish=False,
-                vectorized=True,
-                updating="deferred",
-            )
-            last.append(search.population)
+            last.append(last_generation(kind, draws, episodes, first))
         candidates = np.concatenate(last)
         returns = mean_returns(actor(kind, candidates), FRESH_EPISODES, fresh)
         best.append((float(returns.max()), actor(kind, candidates[[returns.argmax()]])))

@@ -69,7 +69,7 @@ def roll_out_on_host(
             folded = jax.vmap(jax.random.fold_in, (0, None))(keys[some], first)
             of_episodes = (each[some, first : first + side_by_side] for each in counts[:3])
             wave = Counts(*of_episodes, *(each[some] for each in counts[3:]))
-            _count_wave(environment, simulator, acting, folded, seeds, wave)
+            _run_wave(environment, simulator, acting, folded, seeds, wave)
     return counts
 
 
@@ -93,7 +93,7 @@ def paths_on_host(
     return observations, commands, lengths
 
 
-def _count_wave(
+def _run_wave(
     environment: Environment[Any],
     simulator: Neurons,
     actors: Any,

@@ -206,7 +206,7 @@ def optimal_values(
 
 
 def _expect_known(environment: Environment[Any]) -> None:
-    """Refuse an environment that may do what dynamic programming, on the robot's own steps, would not notice."""
+    """Refuse an environment that may change what dynamic programming computes from the robot's own steps."""
     inmost = environment
     while isinstance(inmost, EpisodeLimit | NeuralObservation | ShuffledDelivery | TrialCosts):
         inmost = inmost.inside
@@ -247,7 +247,7 @@ class _Tables:
             low, high = float(of_layer.min()), float(of_layer.max())
             step = max(high - low, 1e-6) / 65535
             self._low[remaining, layer], self._step[remaining, layer] = low, step
-            # Adding a half and truncating rounds, with one pass less.
+            # Truncation after adding a half rounds, in one pass less than `np.rint`.
             self._kept[remaining, layer] = (of_layer - np.float32(low)) * np.float32(1 / step) + np.float32(0.5)
 
     def values(self, remaining: int, layers: slice) -> Float32[np.ndarray, "rows layers nodes"]:
@@ -285,7 +285,7 @@ class _Programme:
     def run(
         self, tables: _Tables | None, seed: int, progress: Progress, starts: Starts | None = None
     ) -> Float64[np.ndarray, " cases"]:
-        """Step back from the end of an episode to its start; return the mean value there, store all in the tables."""
+        """Step back from the end of an episode to its start; returns the mean value there, keeps all in the tables."""
         grid = self._grid
         landings = self._motion.from_grid()
         pairs, weights = side_by_side(self._outcomes)
@@ -306,7 +306,7 @@ class _Programme:
             values, before = before, values
             progress.update(remaining + 1, self._robot.episode_limit)
         first = np.array([INITIAL_HISTORY])
-        at_first = [of_case.start + int(self._layer(case, first)[0]) for case, of_case in enumerate(self._layers)]
+        at_first = [of_case.start + int(self._layer_at(case, first)[0]) for case, of_case in enumerate(self._layers)]
         drawn = jax.random.split(jax.random.key(seed), _STARTS)
         states = jax.vmap(self._robot.reset)(drawn if starts is None else starts.of_episodes(starts.rounds))
         return self._mean_over(values[:, at_first], states)
@@ -328,7 +328,7 @@ class _Programme:
             remaining = limit - 1 - iteration if clock else limit - 1
             rows, row_places, *along = self._motion.from_states(state.robot)
             landings = rows, row_places, *(each[:, :, 0] for each in along)
-            values, layers = tables.values(remaining, self._layers[case]), self._layer(case, state.neurons)
+            values, layers = tables.values(remaining, self._layers[case]), self._layer_at(case, state.neurons)
             led_to = layers, pairs, outcomes.weights, self._costs[case]
             look_ahead(values, *landings, self._grid.row_offsets, *led_to, remaining, chosen)
             before, state = state, _step(environment, episodes, key, state, actions[chosen], simulator)
@@ -338,7 +338,7 @@ class _Programme:
                 break
         return returns
 
-    def _layer(self, case: int, history: Float[Any, "episodes 2"]) -> Int32[np.ndarray, " episodes"]:
+    def _layer_at(self, case: int, history: Float[Any, "episodes 2"]) -> Int32[np.ndarray, " episodes"]:
         """The layer of each episode among those of a case, by its history."""
         memory = memory_of(*self._cases[case])
         return np.zeros(len(history), np.int32) if memory is None else np.asarray(class_of(memory, history), np.int32)

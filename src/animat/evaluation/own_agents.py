@@ -57,7 +57,7 @@ def controls_of_own(
         actor: Actor | Called
         if isinstance(agent, Actor):
             actor = RobotOnly(agent) if has_neurons else agent
-            _try(name, actor, environment, simulator)
+            _expect_actions(name, actor, environment, simulator)
         elif sees_neurons(agent) and not has_neurons:
             got = "one with neural_observation, which these policies do not have"
             raise InvalidArgument(f"agents: {name}: expected one that sees the robot only, got {got}")
@@ -67,8 +67,8 @@ def controls_of_own(
     return controls
 
 
-def _try(name: str, actor: Actor, environment: Environment[Any], simulator: Neurons) -> None:
-    """Raise InvalidArgument for an actor that raises, or whose actions, which JAX would not refuse, are none."""
+def _expect_actions(name: str, actor: Actor, environment: Environment[Any], simulator: Neurons) -> None:
+    """Raise InvalidArgument for an actor that raises, or returns impossible actions, which JAX would not refuse."""
     parts = [np.shape(part) for part in jax.tree.leaves(actor)]
     if jax.tree.leaves(actor) == [actor]:
         expected = "expected a JAX pytree (jax.tree_util.register_static or register_dataclass)"
@@ -78,7 +78,7 @@ def _try(name: str, actor: Actor, environment: Environment[Any], simulator: Neur
         raise InvalidArgument(f"agents: {name}: {expected}, got the shapes {', '.join(map(str, parts))}")
     try:
         if isinstance(environment.robot, HostRobot):
-            # Its indices are checked in its episodes, step by step.
+            # Whether an index is in range is checked later, in each step of its episodes.
             _expect_integers(actor, environment)
             return
         found = np.unique(trace(environment, simulator, actor, episodes=8, seed=1).actions).tolist()

@@ -62,7 +62,7 @@ class Networks(Actor):
     greedy: bool = False
 
     def act(self, environment: Environment[Any], observation: Seen, uniforms: Uniforms) -> Array:
-        # Exactly 1 on the robot it was trained on.
+        # The factor is exactly 1 on the robot of the training.
         observation = observation * (environment.scales / self.scales)
         if not self.greedy:
             return draw_action(environment, self.network, observation, uniforms)

@@ -214,7 +214,7 @@ def _exact_p(a: Float64[np.ndarray, " n"], b: Float64[np.ndarray, " m"]) -> floa
     from scipy.stats import rankdata
 
     # scipy's exact test does not support ties, and its permutations take a second.
-    # Ways are counted by the sum of the smaller group's ranks, doubled, as a tie's may be a half.
+    # Counted by the sum of the smaller group's ranks; ranks are doubled, as those of ties may be halves.
     a, b = sorted((a, b), key=len)
     ranks = np.rint(2 * rankdata(np.concatenate([a, b]))).astype(np.int64)
     n = len(a)
@@ -239,7 +239,7 @@ def _shares_within(share: float, n_first: int, n_second: int) -> tuple[float, fl
         spread = 1 + k * ((1 - true) / (2 - true) + true / (1 + true))
         return (share - true) ** 2 - z**2 * true * (1 - true) * spread / (n_first * n_second)
 
-    # At 0 and 1 the variance is 0: for an observed share of 0 or 1 that root is not an end of the interval.
+    # The variance is 0 at 0 and 1: the root there is not an end of the interval if 0 or 1 was observed.
     close = 1e-9
     low = 0.0 if share <= close else float(brentq(against, 0.0, share - close))
     high = 1.0 if share >= 1 - close else float(brentq(against, share + close, 1.0))

@@ -1,9 +1,9 @@
-"""Evaluation of policies on a simulator: the table of policies, controls and the optimal return."""
+"""Evaluation of policies on a simulator, beside controls and the optimal return."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import chain
 from typing import Any, Self
 
@@ -11,201 +11,27 @@ import numpy as np
 
 from animat.arguments import checked_arguments
 from animat.coding.encoder import electrode_pulses
-from animat.columns import align_columns
 from animat.environment import Animat, Environment, Neurons, WithoutNeurons
-from animat.errors import InvalidArgument, Mismatch, UnusableData, counted, in_min
+from animat.errors import InvalidArgument, Mismatch, UnusableData
 from animat.evaluation import transfer
 from animat.evaluation.controllers import Controller
 from animat.evaluation.controls import Control, Row, controls_of, coupling_of
 from animat.evaluation.coupling import ContextGap, context_gap, least_context_gap
-from animat.evaluation.interventions import InterventionTable, run_interventions
+from animat.evaluation.interventions import run_interventions
 from animat.evaluation.optimal_returns import WellSampled
 from animat.evaluation.optimum import Optimum, best_return
 from animat.evaluation.own_agents import controls_of_own
+from animat.evaluation.result import Evaluation
 from animat.evaluation.rollouts import Actor, networks_of
-from animat.evaluation.statistics import Interval, Verdict, normalised_score
 from animat.goals.robot import objectives_of
-from animat.goals.tally import MEANS, cells_of, satisfaction_line
 from animat.neurons.timeline import SimulatorTimeline
 from animat.progress import Part, Progress, Silent, in_phase
 from animat.recordings.findings import Finding
 from animat.robots.base import Robot, lacking
 from animat.robots.host import HostRobot
-from animat.tables import briefly
 from animat.training.folder import versions_of
 from animat.training.policy import Policy, first_of_alike
 from animat.wrappers import NeuralObservation, TrialCosts, unwrapped
-
-
-@dataclass(frozen=True, eq=False)
-class Evaluation:
-    """Trained policies and controls on one simulator.
-
-    Attributes:
-        mapping: its name; None without neurons.
-        recorded_at_min: time of the simulator's recording; None without neurons.
-        names: the policies, in the order of the first row's actors.
-        rows: the policies first, then the controls.
-        findings: differences between the policies' training and this simulator, and doubts about the optimum.
-        optimum: the optimal return of any controller; None if it was not requested, or is not known.
-        context: how much of the optimum the best coupling leaves unused or, without an optimum, a lower bound of it;
-            None if some conditions are left out of the optimum.
-        no_optimum: why the optimum is not known, if it was requested.
-        fixed_from_min: time of the recording whose percentiles the mapping keeps; None if it uses the simulator's.
-        objectives: of the robot's goal, as texts; empty for a robot without one.
-        whose_work: what the policies lose with each intervention; None if it was not requested.
-        net_optimum: the optimal return of any controller less the cost of pulses, if they have a cost.
-        seed: of all random draws.
-        greedy: whether policies took their most probable actions, or drew them as in training.
-        versions: of what may round or draw differently.
-    """
-
-    __repr__ = briefly
-
-    robot: str
-    mapping: str | None
-    recorded_at_min: float | None
-    names: tuple[str, ...]
-    rows: tuple[Row, ...]
-    findings: tuple[Finding, ...]
-    optimum: Optimum | None = None
-    no_optimum: str | None = None
-    fixed_from_min: float | None = None
-    context: ContextGap | None = None
-    objectives: tuple[str, ...] = ()
-    whose_work: InterventionTable | None = None
-    net_optimum: Optimum | None = None
-    seed: int = 1
-    greedy: bool = True
-    versions: Mapping[str, str] = field(default_factory=dict)
-
-    @property
-    def context_score(self) -> Interval | None:
-        """The policies' context score (`ContextGap.score`)."""
-        if self.context is None or self.rows[0].changed:
-            return None
-        return self.context.score(self.rows[0].mean_returns, self.optimum)
-
-    @property
-    def verdict(self) -> Verdict | None:
-        """Whether the policies outperform the controls; None if none were run."""
-        controls = {row.name: row.episodes.returns for row in self.rows[1:]}
-        return Verdict.of(self.rows[0].episodes.returns, controls) if controls else None
-
-    @property
-    def not_met(self) -> tuple[str, ...]:
-        """Names of the findings because of which these returns cannot be expected of a closed loop on the culture."""
-        return tuple(dict.fromkeys(f.name for f in self.findings if f.name in transfer.NAMES))
-
-    def score(self, row: Row) -> float | None:
-        """The normalised score of a row's mean return, (mean - random) / (optimum - random).
-
-        None if random actions were not run, if no optimum is known or it is not above them, or if the optimum leaves
-        out conditions that the rows use. None also for controls in a changed environment, whose optimum is different:
-        with shuffled delivery the choice has no effect, and a silent culture is not the same culture.
-        """
-        random = next((each for each in self.rows if each.name == "random"), None)
-        if random is None or self.optimum is None or self.optimum.left_out or row.changed:
-            return None
-        mean, at_random, best = float(row.mean_returns.mean()), float(random.mean_returns.mean()), self.optimum.value
-        return normalised_score(mean, at_random, best) if best > at_random else None
-
-    @property
-    def _actions(self) -> str:
-        return "most probable" if self.greedy else "drawn"
-
-    def to_dict(self) -> dict[str, Any]:
-        """Everything as plain data, with the return of each episode."""
-        return {
-            "robot": self.robot,
-            "mapping": self.mapping,
-            "recorded_at_min": self.recorded_at_min,
-            "percentiles_fixed_from_min": self.fixed_from_min,
-            "seed": self.seed,
-            "actions": self._actions,
-            "versions": self.versions,
-            "policies": dict(zip(self.names, self.rows[0].mean_returns.tolist(), strict=True)),
-            "rows": [
-                {**row.to_dict(), "normalised_score": self.score(row), "returns": row.episodes.returns.tolist()}
-                for row in self.rows
-            ],
-            "optimum": None if self.optimum is None else self.optimum.to_dict(),
-            "no_optimum": self.no_optimum,
-            "pulse_cost": self.rows[0].pulse_cost,
-            "net_optimum": None if self.net_optimum is None else self.net_optimum.to_dict(),
-            "context": None if self.context is None else self.context.to_dict(),
-            "context_score": None if self.context_score is None else self.context_score.to_dict(),
-            "whose_work": None if self.whose_work is None else self.whose_work.to_dict(),
-            "not_outperformed": None if self.verdict is None else self.verdict.not_outperformed,
-            "verdict": None if self.verdict is None else str(self.verdict),
-            "not_met_in_a_closed_loop": self.not_met,
-            "findings": [finding.to_dict() for finding in self.findings],
-            **({"objectives": list(self.objectives)} if self.objectives else {}),
-        }
-
-    def to_text(self) -> str:
-        """A table for a terminal: mean return and its standard error, over policies or over a control's episodes."""
-        first_row, first = self.rows[0], self.rows[0].episodes.returns
-        at_min = self.recorded_at_min
-        on = "without neurons" if at_min is None else f"{self.mapping}, recording at {in_min(at_min)}"
-        if self.fixed_from_min is not None:
-            on += f", percentiles fixed from {in_min(self.fixed_from_min)}"
-        goal = MEANS if self.objectives else ()
-        are_counted, cost = first_row.electrode_pulses is not None, first_row.pulse_cost
-        pulse_keys = [*["electrode_pulses"] * are_counted, *["net_return"] * bool(cost)]
-        names = [name.replace("_", " ") for name in pulse_keys]
-        score_head = ["score"] * (self.optimum is not None)
-        head = ["", "mean return", "s.e.", "iterations", "ended early", *names, *goal, *score_head, ""]
-        cells = []
-        for row in self.rows:
-            fields, score = row.to_dict(), self.score(row)
-            error = "" if fields["standard_error"] is None else f"{fields['standard_error']:.1f}"
-            numbers = [f"{fields['mean_return']:.1f}", error, f"{fields['mean_length']:.1f}"]
-            numbers.append(f"{100 * fields['terminated_share']:.0f} %")
-            numbers += ["" if (value := fields[key]) is None else f"{value:.1f}" for key in pulse_keys]
-            numbers += cells_of(row.met) if goal else []
-            numbers += ["" if score is None else f"{score:.2f}" for _ in score_head]
-            cells.append([row.name, *numbers, row.meaning])
-        policies, episodes = counted(len(first), "policy", "policies"), counted(first.shape[1], "episode")
-        how = f"{episodes} each, {self._actions} actions, seed {self.seed}"
-        lines = [f"{self.robot}, {on}: {policies}, {how}", *align_columns(head, cells)]
-        each = ", ".join(f"{name} {x:.1f}" for name, x in zip(self.names, self.rows[0].mean_returns, strict=True))
-        lines.append(f"  each policy: {each}")
-        if cost:
-            lines.append(f"  electrode pulses: per episode; net return: mean return - {cost:g} x electrode pulses")
-        if self.objectives:
-            lines.append(f"  {satisfaction_line(self.objectives, self.rows[0].met)}")
-        if self.verdict is not None:
-            lines.append(f"  {'by return, without the cost: ' if cost else ''}{self.verdict}")
-        if self.not_met:
-            outlook = "it is not known whether a closed loop on the culture would reach these returns"
-            if self.not_met != (transfer.UNKNOWN,):
-                outlook = "these returns cannot be expected of a closed loop on the culture"
-            lines.append(f"  {outlook}: see the warnings ({', '.join(self.not_met)})")
-        lines += [f"  {finding.message}" for finding in self.findings if finding.name == "no-heuristic"]
-        lines += self._optimum_lines()
-        return "\n".join([*lines, *([] if self.whose_work is None else [self.whose_work.to_text()])])
-
-    def _optimum_lines(self) -> list[str]:
-        context = [] if self.context is None else [f"  {self.context.to_text(self.context_score)}"]
-        if self.no_optimum is not None:
-            return [f"  no optimal return: {self.no_optimum}", *context]
-        if self.optimum is None:
-            return []
-        if self.optimum.left_out:
-            meaning = "no score, as the optimal return leaves out conditions that the rows use"
-        elif not self.rows[0].changed and self.score(self.rows[0]) is None:
-            has_random = any(row.name == "random" for row in self.rows)
-            reason = "the optimal return is not above that of" if has_random else "there are no"
-            meaning = f"no score, as {reason} random actions"
-        else:
-            meaning = "score: (mean return - random) / (optimal return - random)"
-            if changed := [row.name for row in self.rows if row.changed]:
-                meaning += f"; none for {' and '.join(changed)}, whose optimum is different"
-        lines = [f"  {self.optimum.to_text()}", f"  {meaning}"]
-        if self.net_optimum is not None:
-            lines.append(f"  with the cost of pulses: {self.net_optimum.to_text()}")
-        return [*lines, *context]
 
 
 @checked_arguments
@@ -261,15 +87,8 @@ def evaluate(
     is_control = first.mapping is not None and first.delivery == "shuffled"
     meaning = "as trained: the delivered condition is drawn at random" if is_control else "as trained"
     trained = Control("policies", meaning, networks, delivery="shuffled" if is_control else "chosen")
-    labels = [condition.label for condition in first.conditions]
-    if first.mapping is None:
-        labels = [f"{command:+g}" for command in first.commands or ()]
-    all_controls = controls_of(*within, labels, networks)
-    if controls is not None:
-        controls, known = (controls,) if isinstance(controls, str) else controls, [each.name for each in all_controls]
-        # A robot may lack a heuristic, and the coupling is searched with the optimum only.
-        if unknown := sorted({*controls} - {*known, "heuristic", "coupling"}):
-            raise InvalidArgument(f"controls: expected some of {', '.join(known)}, got {', '.join(unknown)}")
+    all_controls = controls_of(*within, _labels(first), networks)
+    controls = _expect_controls(controls, [each.name for each in all_controls])
     acting = [trained, *(control for control in all_controls if controls is None or control.name in controls)]
     acting += controls_of_own(
         agents or {}, *within, ["policies", "coupling", *policies, *(each.name for each in all_controls)]
@@ -301,12 +120,7 @@ def evaluate(
     if interventions:
         phase = in_phase(progress, "whose work it is")
         work = run_interventions(*trained.within(*within), networks, episodes=episodes, seed=seed, progress=phase)
-    if optimum is not None:
-        # Less their chance; conditions that the optimum leaves out would not count.
-        reached = [row for row in rows if not row.changed and not optimum.left_out]
-        best = max(reached, key=lambda row: row.mean_returns.mean(), default=None)
-        findings += optimum.findings(None if best is None else best.at_least)
-    findings += () if net_optimum is None else net_optimum.findings()
+    findings += _findings_on(optimum, rows) + (() if net_optimum is None else net_optimum.findings())
     return Evaluation(
         robot=body.name,
         mapping=None if first.mapping is None else first.mapping.name,
@@ -325,6 +139,34 @@ def evaluate(
         greedy=greedy,
         versions=versions_of(("animat", "jax", "jaxlib", "numpy"), [body]),
     )
+
+
+def _labels(policy: Policy) -> list[str]:
+    """What the actions are called: the conditions or, without neurons, the commands."""
+    if policy.mapping is None:
+        return [f"{command:+g}" for command in policy.commands or ()]
+    return [condition.label for condition in policy.conditions]
+
+
+def _expect_controls(wanted: str | Collection[str] | None, known: Sequence[str]) -> Collection[str] | None:
+    """The names of the controls to run, None for all; raises InvalidArgument for an unknown one."""
+    if wanted is None:
+        return None
+    names = (wanted,) if isinstance(wanted, str) else wanted
+    # A robot may lack a heuristic, and the coupling is searched with the optimum only.
+    if unknown := sorted({*names} - {*known, "heuristic", "coupling"}):
+        raise InvalidArgument(f"controls: expected some of {', '.join(known)}, got {', '.join(unknown)}")
+    return names
+
+
+def _findings_on(optimum: Optimum | None, rows: Sequence[Row]) -> tuple[Finding, ...]:
+    """Doubts about the optimum, given what the best of the rows surely reaches."""
+    if optimum is None:
+        return ()
+    # Conditions that the optimum leaves out would not count.
+    reached = [row for row in rows if not row.changed and not optimum.left_out]
+    best = max(reached, key=lambda row: row.mean_returns.mean(), default=None)
+    return optimum.findings(None if best is None else best.at_least)
 
 
 @dataclass(frozen=True, eq=False)

@@ -222,7 +222,7 @@ def _stop(process: subprocess.Popen[bytes]) -> None:
     try:
         process.wait(_PATIENCE_S)
     except subprocess.TimeoutExpired:
-        # Workers whose scheduler died as they started wait for it forever.
+        # A worker whose scheduler died while it started would wait for it for ever.
         os.killpg(process.pid, signal.SIGKILL)
         process.wait()
 

@@ -149,7 +149,7 @@ def _own_cores(threads: int) -> list[int]:
         except OSError:
             file.close()
             continue
-        # Held until this process ends.
+        # The lock is held until this process ends.
         _HELD.append(file)
         own.append(core)
         if len(own) == threads:

@@ -34,7 +34,7 @@ _SILENT_S = 60.0
 
 @dataclass(eq=False)
 class Call:
-    """A call that waits or runs; it has failed, and its process or worker ended (`deaths`), so many times.
+    """A call that waits or runs, how often it has failed, and how often its process or worker ended (`deaths`).
 
     Attributes:
         pickled: returns the pickled function, arguments and keyword arguments for a worker with this folder.
@@ -149,7 +149,7 @@ class Dispatch:
             resource = next(name for name in worker["resources"] if name.startswith(PLACE_PREFIX))
             workers[resource] = address, worker
         for resource in self._places.keys() - workers.keys():
-            self._lose(self._places.pop(resource), "ended")
+            self._mark_lost(self._places.pop(resource), "ended")
         for resource, (address, worker) in workers.items():
             if resource not in self._places:
                 folder = Path(worker["local_directory"])
@@ -161,13 +161,13 @@ class Dispatch:
                     # It was frozen, and continues.
                     place.lost = asyncio.get_running_loop().create_future()
             elif time.monotonic() - place.heard_s > _SILENT_S:
-                self._lose(place, f"has been silent for {_SILENT_S:.0f} s (frozen, or cut off)")
+                self._mark_lost(place, f"has been silent for {_SILENT_S:.0f} s (frozen, or cut off)")
         if self._waiting and not self._places and not self._waits_for_workers:
             print("cluster: waiting for workers", file=sys.stderr)
         self._waits_for_workers = not self._places
         self._assign()
 
-    def _lose(self, place: _Place, reason: str) -> None:
+    def _mark_lost(self, place: _Place, reason: str) -> None:
         if not place.lost.done():
             for batch in place.batches:
                 batch.has_begun = not batch.is_alone or all(other.is_alone for other in place.batches)
@@ -259,7 +259,7 @@ class Dispatch:
             await future.cancel()
             answers.cancel()
             if batch.has_begun:
-                _blame(left[batch.done - batch.answered], f"worker {place.address} {place.lost.result()}")
+                _count_death(left[batch.done - batch.answered], f"worker {place.address} {place.lost.result()}")
         elif answers.cancelled() or answers.exception() is not None:
             self._handle_failure(left, answers)
         else:
@@ -273,7 +273,7 @@ class Dispatch:
         """Handle a batch that was not done: the scheduler or the worker ended, or it could not be sent."""
         error = None if answers.cancelled() else answers.exception()
         if type(error).__name__ == "KilledWorker":
-            _blame(left[0], "its worker ended")
+            _count_death(left[0], "its worker ended")
         elif error is not None and "Cancelled" not in type(error).__name__:
             for call in left:
                 _settle(call, error=error)
@@ -304,7 +304,7 @@ class Dispatch:
             self._expected_s += call.cost_s
             self._took_s += answer.took_s
         if answer.ended is not None:
-            _blame(call, answer.ended)
+            _count_death(call, answer.ended)
             if not call.future.done():
                 _warn(f"{call.name}: {answer.ended}; trying again")
         elif answer.error is not None and call.failures + 1 < ATTEMPTS:
@@ -317,7 +317,7 @@ class Dispatch:
                 _settle(call, error=error)
 
     def _end(self, error: Exception | None = None) -> None:
-        """Give up all calls: the scheduler has ended, or an unexpected error occurred."""
+        """Give up all calls, as the scheduler has ended, or with an unexpected error."""
         self._has_ended = True
         for call in (*self._waiting, *(call for batch in self._batches.values() for call in batch.calls)):
             if error is None:
@@ -329,12 +329,12 @@ class Dispatch:
 
 def _cancel(call: Call) -> None:
     if not call.future.done() and call.future.cancel():
-        # Only this wakes those who wait for it.
+        # Needed to wake those who wait for the future.
         call.future.set_running_or_notify_cancel()
 
 
-def _blame(call: Call, reason: str) -> None:
-    """Count, and the last time report, that a call's process or worker ended while it was running."""
+def _count_death(call: Call, reason: str) -> None:
+    """Count that a call's process or worker ended while it was running; after `ATTEMPTS` times the call fails."""
     call.deaths += 1
     if call.deaths == ATTEMPTS:
         _settle(call, error=BrokenExecutor(f"its process or worker ended {ATTEMPTS} times, last: {reason}"))

@@ -7,7 +7,7 @@ import json
 import math
 import signal
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, wait
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -88,26 +88,10 @@ class Jobs:
         # Left by a run that was killed; the locks stay, as they may still be held.
         for stale in notices.glob("*.json"):
             stale.unlink(missing_ok=True)
-        total_s = sum(costs_s.values())
         running: dict[Future[TaskResult], Job] = {}
         failed: list[AnimatError] = []
         cpu_s: dict[str, float] = {}
         reported_s = -math.inf
-
-        def report() -> None:
-            nonlocal reported_s
-            reported_s = time.monotonic()
-            left_s, parts = sum(job.cost_s for job in self.waiting), []
-            for job in running.values():
-                share, text = reported(receipt_path(notices, job.name)) or (0.0, None)
-                left_s += job.cost_s * (1.0 - share)
-                if text is not None:
-                    parts.append(f"{job.name} {100 * share:.0f} % {text}".strip())
-            n_jobs = len(self._done) + len(running) + len(self.waiting) + len(failed)
-            if failed:
-                parts.append(f"{len(failed)} failed")
-            note = "; ".join((f"{len(self._done)} of {counted(n_jobs, 'job')}", *parts))
-            progress.update(total_s - left_s, total_s, note if running or failed else "")
 
         def keep(future: Future[TaskResult]) -> None:
             job, result = running[future], future.result()
@@ -124,7 +108,8 @@ class Jobs:
                 left = [job for job in ready if not self._is_done(job)]
                 running |= zip(self._submit(left, cores, gpu, notices), left, strict=True)
                 if time.monotonic() - reported_s > _LOOK_EVERY_S:
-                    report()
+                    reported_s = time.monotonic()
+                    self._report(progress, running.values(), len(failed), notices)
                 # Successful ones first, so that their receipts are kept whatever the others raise.
                 ended = wait(running, _LOOK_EVERY_S, FIRST_COMPLETED).done
                 for future in sorted(ended, key=lambda each: each.cancelled() or each.exception() is not None):
@@ -137,7 +122,7 @@ class Jobs:
                     else:
                         keep(future)
                     del running[future]
-        report()
+        self._report(progress, (), len(failed), notices)
         if failed:
             # Sorted, so that the message does not depend on the order in which they ended.
             failed.sort(key=str)
@@ -145,6 +130,21 @@ class Jobs:
             failed[0].args = ("; ".join(map(str, failed)) + blocked,)
             raise failed[0]
         return cpu_s
+
+    def _report(self, progress: Progress, running: Collection[Job], n_failed: int, notices: Path) -> None:
+        """Report how much of the cost is done, with what running jobs have noted."""
+        total_s = sum(job.cost_s for job in self._jobs.values())
+        left_s, parts = sum(job.cost_s for job in self.waiting), list[str]()
+        for job in running:
+            share, text = reported(receipt_path(notices, job.name)) or (0.0, None)
+            left_s += job.cost_s * (1.0 - share)
+            if text is not None:
+                parts.append(f"{job.name} {100 * share:.0f} % {text}".strip())
+        n_jobs = len(self._done) + len(running) + len(self.waiting) + n_failed
+        if n_failed:
+            parts.append(f"{n_failed} failed")
+        note = "; ".join((f"{len(self._done)} of {counted(n_jobs, 'job')}", *parts))
+        progress.update(total_s - left_s, total_s, note if running or n_failed else "")
 
     def _submit(
         self, jobs: Sequence[Job], cores: Executor, gpu: Executor | None, notices: Path

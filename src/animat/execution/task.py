@@ -61,7 +61,7 @@ class TaskResult:
 
 
 def carry_out_alone(task: Task, folder: Path, notice: Path) -> TaskResult:
-    """`carry_out` once no other process is doing so, as a worker may not notice that its client was killed."""
+    """`carry_out`, once no other process does: the worker of a client that was killed may still be running the task."""
     if not notice.parent.is_dir():
         raise InvalidFile(
             f"{folder}: expected a folder that all workers see, at the same place; {platform.node()} does not see it, "

@@ -97,7 +97,7 @@ class Range:
         return Range(self.quantity, low, high, spec[self.quantity].unit, self.outside)
 
     def margin(self, values: Mapping[str, Array], spec: Mapping[str, Quantity]) -> Float[Array, ""]:
-        """How far inside it a robot is, in scales of the quantity; below 0 outside; all in the units of `spec`."""
+        """How far inside the range a robot is, in scales of the quantity; negative outside; in the units of `spec`."""
         value = values[self.quantity]
         distances = [] if self.low is None else [value - self.low]
         distances += [] if self.high is None else [self.high - value]

@@ -42,7 +42,7 @@ def grid_with_goal(
     if any(objective.within is not None for objective in objectives):
         raise InvalidArgument("goal: expected none with `within` for an optimal return, got one")
     grid: Grid = capability(robot, "value_grid")()
-    left = zip((grid.along, *grid.rows), _left(robot, grid, objectives, spec), strict=True)
+    left = zip((grid.along, *grid.rows), _goes_on_beyond(robot, grid, objectives, spec), strict=True)
     is_decided = _is_decided(robot, grid, objectives, spec)
     return replace(
         grid,
@@ -60,13 +60,13 @@ def _gone_beyond(robot: Robot[Any], axis: Axis) -> str:
     return f"goal: expected {expected}, got one with which they go on, {where}"
 
 
-def _sampled(grid: Grid, n: int) -> tuple[Array, Array]:
+def _random_nodes(grid: Grid, n: int) -> tuple[Array, Array]:
     """Random nodes: their rows, and their places along these."""
     row, node = jax.random.randint(jax.random.key(0), (2, n), 0, jnp.array([[grid.n_rows], [grid.along.stored]]))
     return row, node
 
 
-def _left(
+def _goes_on_beyond(
     robot: Robot[Any], grid: Grid, objectives: Sequence[Objective], spec: Mapping[str, Quantity]
 ) -> Bool[np.ndarray, " axes"]:
     """Whether episodes with the goal go on beyond the ends of each axis where the task ended, and depend on how far.
@@ -104,7 +104,7 @@ def _left(
         return jnp.stack(found)
 
     each = jax.vmap(jax.vmap(leaves, (None, None, 0)), (0, 0, None))
-    return np.asarray(jax.jit(each)(*_sampled(grid, _SAMPLES), jnp.array([-1.0, 1.0])).any(axis=(0, 1)))
+    return np.asarray(jax.jit(each)(*_random_nodes(grid, _SAMPLES), jnp.array([-1.0, 1.0])).any(axis=(0, 1)))
 
 
 def _is_decided(robot: Robot[Any], grid: Grid, objectives: Sequence[Objective], spec: Mapping[str, Quantity]) -> bool:
@@ -117,5 +117,5 @@ def _is_decided(robot: Robot[Any], grid: Grid, objectives: Sequence[Objective], 
         return margins[decide]
 
     after = jax.vmap(margins_after, (0, 0, None, None))
-    nodes = _sampled(grid, 256)
+    nodes = _random_nodes(grid, 256)
     return bool(jnp.allclose(after(*nodes, 0.0, -1.0), after(*nodes, 1.0, 1.0), atol=1e-5))

@@ -83,7 +83,7 @@ class RobotWithGoal(Robot[GoalState]):
             object.__setattr__(self, name, getattr(robot, name))
 
     def __getattr__(self, name: str) -> Any:
-        # It has those optional methods that its robot has.
+        # The optional methods are those of its robot.
         if name in (*WITHOUT, "with_goal_of") and hasattr(self.robot, name):
             own = {"value_grid": partial(_grid_of, self), "with_goal_of": self._with_goal_of}
             return own.get(name) or getattr(self.robot, name)

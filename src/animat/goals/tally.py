@@ -99,7 +99,7 @@ def outcome(objectives: Sequence[Objective], tally: Tally, episode_limit: int) -
     avoids, reaches, margins = of_kind(objectives, "avoid"), of_kind(objectives, "reach"), tally.margins
     avoided = jnp.where(tally.inside > 0, (tally.iterations - 1) / episode_limit, 1.0)
     out_of = jnp.maximum(jnp.where(tally.failed, episode_limit, tally.iterations), 1)
-    # One by one: where many are divided by one number, XLA multiplies by its reciprocal, which is rounded.
+    # One division each: to divide an array by a number, XLA multiplies by the rounded reciprocal.
     there = jnp.stack([inside / out_of for inside in tally.inside])
     satisfaction = jnp.where(avoids, avoided, jnp.where(reaches, 1.0 + jnp.minimum(margins, 0.0), there))
     if reaches.any():

@@ -215,7 +215,7 @@ class AnimatEnv(CompiledAnimats, gymnasium.Env[Float32[np.ndarray, " observation
             self._was_warned = True
         rows = self._step(rows, np.array([action]), self.np_random)
         after, observations = self._go_on_from(rows, np.zeros(1, bool))
-        # Python numbers; arrays with several readouts.
+        # Python numbers for one readout, arrays for several.
         info = {name: value[0] if value.ndim > 1 else value[0].item() for name, value in after.info.items()}
         info |= {name: value[0] if value.ndim > 1 else value[0].item() for name, value in self._outcomes(after).items()}
         terminated, truncated = (bool(each[0]) for each in after.ended)

@@ -30,6 +30,7 @@ from animat.responses.conditions import conditions_named
 from animat.responses.extraction import extract_series
 from animat.responses.readouts import DEFAULT_READOUTS, Readouts
 from animat.responses.windows import DEFAULT_WINDOW_MS, check_window
+from animat.robots.base import Robot
 from animat.robots.checking import check_robot
 from animat.robots.host import HostRobot
 from animat.robots.registry import robot_named
@@ -102,25 +103,7 @@ def set_up(
         InvalidFile: for recordings that cannot be read.
         UnusableData: for recordings that no controller can learn from.
     """
-    if robot == "":
-        raise InvalidArgument(
-            "robot: expected a name, as in gymnasium.make('Animat/Robot-v0', robot='shuttle'), got none"
-        )
-    try:
-        body = robot_named(robot, **parameters)
-    except InvalidArgument as error:
-        # A misspelt option is taken for a parameter of the robot.
-        named = [name for name in parameters if str(error).endswith(repr(name))]
-        hint = did_you_mean(named[0], signature(set_up).parameters) if named else ""
-        if "max_episode_steps" in named:
-            hint = ": the robot's own is episode_limit"
-        raise InvalidArgument(f"{error}{hint}") from None
-    if isinstance(body, HostRobot):
-        raise InvalidArgument(
-            f"robot: expected one stepped in JAX, got {body.name}, which Gymnasium steps: use it with animat train"
-        )
-    if not is_ours(body):
-        check_robot(body)
+    body = _robot(robot, parameters)
     if goal is not None:
         body = with_goal(body, goal)
     for caveat in body.caveats():
@@ -170,3 +153,27 @@ def set_up(
     if neural_observation:
         environment = NeuralObservation(environment)
     return Setup(EpisodeLimit(environment), simulator, labels)
+
+
+def _robot(name: str, parameters: dict[str, Any]) -> Robot[Any]:
+    """The robot of this name, checked if it is not one of ours; an error hints at a misspelt option."""
+    if name == "":
+        raise InvalidArgument(
+            "robot: expected a name, as in gymnasium.make('Animat/Robot-v0', robot='shuttle'), got none"
+        )
+    try:
+        robot = robot_named(name, **parameters)
+    except InvalidArgument as error:
+        # A misspelt option is taken for a parameter of the robot.
+        named = [parameter for parameter in parameters if str(error).endswith(repr(parameter))]
+        hint = did_you_mean(named[0], signature(set_up).parameters) if named else ""
+        if "max_episode_steps" in named:
+            hint = ": the robot's own is episode_limit"
+        raise InvalidArgument(f"{error}{hint}") from None
+    if isinstance(robot, HostRobot):
+        raise InvalidArgument(
+            f"robot: expected one stepped in JAX, got {robot.name}, which Gymnasium steps: use it with animat train"
+        )
+    if not is_ours(robot):
+        check_robot(robot)
+    return robot

@@ -126,7 +126,7 @@ def live(
         policies = run.shadow(progress)
         first, at_min = next(iter(policies.values())), run.used[-1].start_min
         calibration = Calibration.of_series(run.used, first, at_min=at_min, adaptive=adaptive, kind=kind)
-        # Its own lock, by which viewers know that it is running.
+        # The session has its own lock, by which viewers see that it is running.
         with exclusive_lock(run.folder / SESSION):
             gap = run_policies(
                 policies,
@@ -195,7 +195,7 @@ class _Run:
         with Trainers(groups, self.folder / _EXCHANGE, policies) as trainers:
             self.write("training", policies=self.training.policies, processes=len(groups))
             try:
-                self._follow(trainers, progress)
+                self._record_on_schedule(trainers, progress)
             except BaseException as error:
                 self.end_early(error)
                 # Unfinished policies are better than none.
@@ -203,7 +203,7 @@ class _Run:
                     trainers.finish()
                 raise
             progress.update(minutes, minutes, "waiting for the last chunk of training")
-            self._note(trainers.finish())
+            self._log_swaps(trainers.finish())
             self.iterations = trainers.iterations
         self.culture_min = (self.culture.now_s - self._zero_s) / 60
         self.wall_s = time.monotonic() - self._wall_zero_s
@@ -222,7 +222,7 @@ class _Run:
         with suppress(InvalidFile):
             self.write("interrupted" if is_person else "fault", message=message)
 
-    def _follow(self, trainers: Trainers, progress: Progress) -> None:
+    def _record_on_schedule(self, trainers: Trainers, progress: Progress) -> None:
         """Record on time, for the processes that train meanwhile."""
         in_budget = True
         for number in range(1, self.timetable.recordings):
@@ -244,7 +244,7 @@ class _Run:
         """Wait, while training continues, until the culture's clock is at a minute of the run."""
         due_s = self._wall_zero_s + 60 * minute / self.timetable.speed
         while time.monotonic() < due_s or not trainers.use_the_newest:
-            self._note(trainers.swaps(_POLL_S))
+            self._log_swaps(trainers.swaps(_POLL_S))
             passed_min = (time.monotonic() - self._wall_zero_s) * self.timetable.speed / 60
             mean = "" if math.isnan(trainers.mean_return) else f", return {trainers.mean_return:.1f}"
             note = f"{counted(len(self.files), 'recording')}, {counted(len(self.swaps), 'swap')}{mean}"
@@ -289,7 +289,7 @@ class _Run:
         if isinstance(self.culture, VirtualCulture):
             self.culture.save_state(self.folder / RECORDINGS / STATE_FILE)
 
-    def _note(self, swaps: Sequence[dict[str, Any]]) -> None:
+    def _log_swaps(self, swaps: Sequence[dict[str, Any]]) -> None:
         for swap in swaps:
             if swap["swap"] > 0:
                 self.swaps.append({**swap, **self.write("swap", **swap)})
@@ -297,7 +297,7 @@ class _Run:
                 self.write("training began", **swap)
 
     def write(self, what: str, **fields: Any) -> dict[str, Any]:
-        # Its last known time if the connection is lost.
+        # If the connection is lost, the last known time is logged.
         with suppress(Exception):
             self._known_s = self.culture.now_s
         at, wall_s = datetime.now(UTC).isoformat(timespec="milliseconds"), time.monotonic() - self._wall_zero_s

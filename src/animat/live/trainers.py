@@ -113,7 +113,7 @@ class Trainers:
 
     def __enter__(self) -> Trainers:
         self.publish(0, self._groups[0].timeline)
-        # The last cores first, to leave one to the process that records. All groups train at once, on any number.
+        # The last cores first, to leave the first to the process that records; groups share cores if there are too few.
         cores = own_cores()[::-1]
         self._executor = PinnedProcesses([cores[i % len(cores)] for i in range(len(self._groups))])
         for group in self._groups:

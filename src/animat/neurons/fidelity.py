@@ -77,14 +77,14 @@ def fidelity(responses: Responses, simulator: NeuronSimulator) -> Fidelity:
         above = int(np.count_nonzero(read_hz[kept] > np.asarray(simulator.edges_hz)[..., -1]))
     labels = tuple(condition.label for condition in responses.conditions)
     if isinstance(simulator, MemorySimulator):
-        shares = _shares_after_each(simulator, median_hz)
+        shares = _shares_above_median(simulator, median_hz)
     else:
         shares = np.mean(np.asarray(_evenly_drawn(simulator, 20_000)) >= median_hz, axis=1, dtype=np.float32)
     return Fidelity(labels, in_data, np.asarray(shares, np.float64), above, responses.readouts.names)
 
 
 @jax.jit
-def _shares_after_each(simulator: MemorySimulator, median_hz: Rates) -> Float[Array, "conditions *readouts"]:
+def _shares_above_median(simulator: MemorySimulator, median_hz: Rates) -> Float[Array, "conditions *readouts"]:
     """The share of answers to every condition that reach the median, over the histories of its own responses."""
     rows = jnp.arange(simulator.before.shape[1])
 

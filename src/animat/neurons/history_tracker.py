@@ -59,15 +59,15 @@ class HistoryTracker:
         load = before.load * np.exp((before.at_s - at_s) / load_s) if load_s else before.load
         return HistoryState(0.0 if is_rested else before.trace, float(load), float(at_s))
 
-    def after(self, came: HistoryState, condition: int, rate_hz: float, *, is_burst: bool) -> HistoryState:
+    def after(self, at_trial: HistoryState, condition: int, rate_hz: float, *, is_burst: bool) -> HistoryState:
         """The state after a trial, from that at it and the response of all channels, Hz per channel."""
         rank = ranks_among(self.sorted_hz, np.array([rate_hz]))
         # For trials without a condition, the middle rank is as good as any.
         mean = 0.5 if condition == NO_CONDITION else float(self.mean_ranks[condition])
         (more,) = trace_increment(rank, mean, self.memory).tolist()
         # After a burst the trace is not known.
-        trace = 0.5 if is_burst else self.memory.decay * came.trace + more
-        return HistoryState(float(trace), came.load + self.added, came.at_s)
+        trace = 0.5 if is_burst else self.memory.decay * at_trial.trace + more
+        return HistoryState(float(trace), at_trial.load + self.added, at_trial.at_s)
 
     def observed(self, state: HistoryState) -> tuple[float, float]:
         """Trace and load as a policy sees them (`animat.wrappers.NeuralObservation`)."""
@@ -119,10 +119,12 @@ class AdjustedRanks:
         return cls(remembering, sorted_hz, slopes, *of_condition)
 
     def of_response(
-        self, came: HistoryState, read_hz: Float64[np.ndarray, "*readouts"]
+        self, at_trial: HistoryState, read_hz: Float64[np.ndarray, "*readouts"]
     ) -> Float64[np.ndarray, " readouts"]:
         """y of another response, with the history state at its trial (`HistoryTracker.when`)."""
-        return np.asarray(_ranks(self.sorted_hz, read_hz[None])[0] - np.array([came.trace, came.load]) @ self.slopes)
+        return np.asarray(
+            _ranks(self.sorted_hz, read_hz[None])[0] - np.array([at_trial.trace, at_trial.load]) @ self.slopes
+        )
 
     def of_responses(self, responses: Responses) -> Float64[np.ndarray, "responses readouts"]:
         """y of other responses; raises UnusableData if the times of their trials are not known."""
@@ -132,9 +134,9 @@ class AdjustedRanks:
         state, history = HistoryState(), []
         trials = (presented.time_s, presented.is_rested, presented.condition, presented.rate_hz, presented.is_burst)
         for at_s, is_rested, condition, rate_hz, is_burst in zip(*(x.tolist() for x in trials), strict=True):
-            came = self.remembering.when(state, at_s, is_rested=is_rested)
-            state = self.remembering.after(came, condition, rate_hz, is_burst=is_burst)
-            history.append((came.trace, came.load))
+            at_trial = self.remembering.when(state, at_s, is_rested=is_rested)
+            state = self.remembering.after(at_trial, condition, rate_hz, is_burst=is_burst)
+            history.append((at_trial.trace, at_trial.load))
         return np.asarray(_ranks(self.sorted_hz, responses.read_hz) - np.array(history)[place] @ self.slopes)
 
 

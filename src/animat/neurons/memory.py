@@ -201,7 +201,7 @@ def _has_load(ranked: Ranked, memory: Memory) -> bool:
     trace, load = ranked.traces(memory), ranked.loads(_LOAD_S)
     if not load.added:
         return False
-    # Each condition has its own coefficients, so that differences of means explain nothing.
+    # Each condition has its own coefficients, so that differences between their means have no influence.
     one = np.concatenate([np.eye(len(ranked.rows))[[c] * len(rows)] for c, rows in enumerate(ranked.rows)])
     every = np.concatenate(ranked.rows)
     rank = ranked.rank[every]

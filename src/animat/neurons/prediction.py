@@ -147,7 +147,7 @@ def predict(simulator: NeuronSimulator | None, halves: Halves) -> Prediction:
         counts = np.array([len(halves.first_of(c)) for c in range(simulator.n_conditions)])
         own = ... if halves.readout is None else halves.readout
         cumulatives, edges_hz = np.asarray(simulator.cumulative)[own], np.asarray(simulator.edges_hz)[own]
-        of_condition = [np.diff(_below(each, edges_hz, values_hz[1:]), prepend=0, append=1) for each in cumulatives]
+        of_condition = [np.diff(_p_below(each, edges_hz, values_hz[1:]), prepend=0, append=1) for each in cumulatives]
     return Prediction(halves, np.stack(of_condition)[halves.condition], counts[halves.condition].astype(np.float64))
 
 
@@ -169,7 +169,7 @@ def _shares(x_hz: Float[np.ndarray, " n"], values_hz: Float[np.ndarray, " values
     return np.bincount(np.searchsorted(values_hz, x_hz), minlength=len(values_hz)) / len(x_hz)
 
 
-def _below(
+def _p_below(
     cumulative: Float[np.ndarray, " edges"], edges_hz: Float[np.ndarray, " edges"], x_hz: Float[np.ndarray, " some"]
 ) -> Float64[np.ndarray, " some"]:
     """P(draw < x) of a histogram; a bin between two equal edges is drawn as that value."""
@@ -188,17 +188,17 @@ def share_below(
     Source: the non-randomised transform of Czado, Gneiting and Held 2009, doi:10.1111/j.1541-0420.2009.01191.x.
     """
     low, high = transforms.T
-    # The difference below would not be exact for those that are hardly spread.
+    # Those with hardly any spread count as points: the difference below would not be exact.
     is_spread = high - low > 1e-6
     low, high, points = low[is_spread], high[is_spread], np.sort(low[~is_spread])
     density = 1 / (high - low)
-    # A share that rises from F(x-) to F(x) is the difference of two that rise from there on for ever.
-    rising = _rising(low, density, at) - _rising(high, density, at)
-    # 1e-12: shares are rounded, and what is at a place is not below it.
+    # A ramp from F(x-) to F(x) is the difference of two endless ramps that begin there.
+    rising = _sum_of_ramps(low, density, at) - _sum_of_ramps(high, density, at)
+    # 1e-12: a point at a place is not below it, but shares are rounded.
     return np.asarray((rising + np.searchsorted(points, at - 1e-12)) / len(transforms))
 
 
-def _rising(
+def _sum_of_ramps(
     since: Float64[np.ndarray, " n"], density: Float64[np.ndarray, " n"], at: Float64[np.ndarray, " places"]
 ) -> Float64[np.ndarray, " places"]:
     """The sum of density (at - since) over those that have begun."""
@@ -246,13 +246,13 @@ def free_runs(
         presented.is_rested,
     )
     uniforms = rng.random((len(left) - since, n), np.float32)
-    rate_hz = _remembering(simulator, np.float32(traces[since]), tuple(each[since:] for each in trials), uniforms)
+    rate_hz = _runs_with_memory(simulator, np.float32(traces[since]), tuple(each[since:] for each in trials), uniforms)
     runs[:, places] = halves.read(np.asarray(rate_hz))[places - since].T
     return runs
 
 
 @jax.jit
-def _remembering(
+def _runs_with_memory(
     simulator: MemorySimulator, trace: Float[Array, ""], trials: tuple[Array, ...], uniforms: Float[Array, "trials n"]
 ) -> Float[Array, "trials n *readouts"]:
     """Answers of n runs to the trials, whose arrays are those of `free_runs`, from one trace on."""
@@ -293,7 +293,7 @@ def shares_lasting(lengths: Int64[np.ndarray, " runs"]) -> Float64[np.ndarray, "
 
 
 def in_time(series: Float64[np.ndarray, "n trials"], threshold_hz: float) -> tuple[Any, Any, Any]:
-    """The autocorrelation of each series, the mean length of its runs, and the shares that last."""
+    """For each series its autocorrelation, the mean length of its runs, and `shares_lasting` of these."""
     lengths = [run_lengths(one, threshold_hz) for one in series]
     means = [runs.mean() if len(runs) else np.nan for runs in lengths]
     return autocorrelation(series), np.array(means), np.array([shares_lasting(runs) for runs in lengths])

@@ -281,7 +281,7 @@ def fit_simulator(
         return fit_empirical(responses, room=room)
     if kind == "memory":
         fitted = fit_memory(responses, room=room, memory=memory)
-        # Without a memory the trace stays as it begins, which is what policies see in a loop (`HistoryTracker`).
+        # Without memory the trace keeps its initial value, as for policies in a loop (`HistoryTracker`).
         still = jnp.full_like(fitted.left, INITIAL_HISTORY[0])
         return replace(fitted, left=still) if fitted.memory == NO_MEMORY else fitted
     raise InvalidArgument(f"kind: expected one of {', '.join(get_args(Kind))}, got {kind!r}")

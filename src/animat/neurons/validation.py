@@ -227,7 +227,7 @@ def validate(responses: Responses, *, kind: str | None = None, seed: int = 1, re
     for each in (MARGINAL, *kinds):
         simulator = simulators.get(each)
         prediction = predict(simulator, halves)
-        # Without memory it is the empirical simulator, than which that one is not coarser.
+        # The prior of a memory simulator is the empirical one, which it refines; that of the others is the marginal.
         remembers = isinstance(simulator, MemorySimulator) and simulator.memory != NO_MEMORY
         prior = probabilities.get("empirical" if remembers else MARGINAL, 1 / CLASSES)
         probabilities[each] = prediction.of_commands(prior)
@@ -235,19 +235,19 @@ def validate(responses: Responses, *, kind: str | None = None, seed: int = 1, re
         transforms = prediction.transforms()
         distance = distance_from_uniform(transforms)
         correlation, length, lasting = map(_band, in_time(free_runs(simulator, prediction, FREE_RUNS, rng), median_hz))
-        passing = prediction.probability @ (halves.values_hz >= median_hz)
+        by_chance = (1 + int(np.sum(distances >= distance))) / (1 + _CHANCES)
         scores.append(
             Scores(
-                each,
-                np.log2(of_observed),
-                prediction.crps(),
-                transforms,
-                distance,
-                None if each in (MARGINAL, "memory") else (1 + int(np.sum(distances >= distance))) / (1 + _CHANCES),
-                correlation,
-                length,
-                lasting,
-                _by_condition(passing, halves),
+                kind=each,
+                bits=np.log2(of_observed),
+                crps_hz=prediction.crps(),
+                transforms=transforms,
+                distance=distance,
+                p_value=None if each in (MARGINAL, "memory") else by_chance,
+                autocorrelation=correlation,
+                run_length=length,
+                lasting=lasting,
+                above=_by_condition(prediction.probability @ (halves.values_hz >= median_hz), halves),
             )
         )
     # At its own median, as a loop's thresholds adapt: drift is reported separately.
@@ -257,18 +257,18 @@ def validate(responses: Responses, *, kind: str | None = None, seed: int = 1, re
     first = [halves.first_of(c) for c in conditions]
     second = [halves.x_hz[halves.condition == c] for c in conditions]
     return Validation(
-        tuple(condition.label for condition in responses.conditions),
-        tuple(map(len, first)),
-        tuple(map(len, second)),
-        np.array([[np.median(x) for x in half] for half in (first, second)], np.float64),
-        _by_condition(halves.x_hz >= median_hz, halves),
-        recorded_correlation,
-        recorded_length,
-        recorded_lasting,
-        tuple(scores),
-        kind or default_kind(responses),
-        responses.is_blocked,
-        band,
+        labels=tuple(condition.label for condition in responses.conditions),
+        n_fitted=tuple(map(len, first)),
+        n_held=tuple(map(len, second)),
+        medians_hz=np.array([[np.median(x) for x in half] for half in (first, second)], np.float64),
+        above=_by_condition(halves.x_hz >= median_hz, halves),
+        autocorrelation=recorded_correlation,
+        run_length=recorded_length,
+        lasting=recorded_lasting,
+        scores=tuple(scores),
+        kind=kind or default_kind(responses),
+        is_blocked=responses.is_blocked,
+        pit_band=band,
     )
 
 
@@ -317,7 +317,7 @@ def _chance_levels(
     distances, shares = [], []
     for _ in range(_CHANCES):
         transforms = np.concatenate([_shuffled(*of_condition, rng) for of_condition in parts])
-        # At both sides of every step: not smaller than to 0.001.
+        # Just below and above every step of the distribution, where the distance is largest.
         at = np.unique(transforms)
         distances.append(max(np.abs(share_below(transforms, at + side) - at).max() for side in (0.0, 1e-11)))
         shares.append(pit_shares(transforms))

@@ -21,7 +21,7 @@ from animat.neurons.history import Ranked
 from animat.neurons.history_tracker import AdjustedRanks, HistoryState, HistoryTracker
 from animat.neurons.memory import MemorySimulator
 from animat.neurons.simulator import NeuronSimulator
-from animat.neurons.timeline import Kind, fit_simulator, fit_timeline, room_for
+from animat.neurons.timeline import Kind, SimulatorTimeline, fit_simulator, fit_timeline, room_for
 from animat.recordings.findings import Finding
 from animat.recordings.recorded_culture import RecordedCulture
 from animat.recordings.recording import Recording
@@ -132,18 +132,11 @@ class Calibration:
                 whose mapping is not thresholds.
             kind, bins, range_hz: of the simulator, see `fit_timeline`, whose errors are raised.
         """
-        own_min = min(policy.recorded_at_min[:1], default=-np.inf) if policy is not None else -np.inf
-        own = [each for each in series if each.start_min >= own_min]
-        older, findings = len(series) - len(own), tuple[Finding, ...]()
-        if older and own and (at_min is None or at_min >= own_min):
-            what = f"not used: {counted(older, 'recording')} before that at {in_min(own_min)}, the policies' first one"
-            series, findings = own, (Finding("older-recordings", "note", what, float(older)),)
+        series, findings = _own_recordings(series, policy, at_min)
         timeline = fit_timeline(series, kind=kind, bins=bins, range_hz=range_hz)
         fit: dict[str, Any] = {"kind": timeline.fitted["kind"], "bins": bins, "range_hz": range_hz}
         if at_min is None:
-            first_min, last_min = (float(timeline.start_min[i]) for i in (0, -1))
-            trained_until = None if policy is None else policy.trained_until_min(first_min)
-            at_min = last_min if policy is None else first_min if trained_until is None else trained_until
+            at_min = _last_minute(timeline, policy)
         start_min = float(timeline.start_min[timeline.requested_row(at_min)])
         responses = next(each for each in series if each.start_min == start_min)
         rng = np.random.default_rng(0)
@@ -191,6 +184,31 @@ class Calibration:
         simulator, *bootstraps = (replace(each, percentiles=percentiles) for each in fitted)
         own = np.asarray(percentiles, np.float64)
         return replace(self, percentiles=own, simulator=simulator, bootstraps=tuple(bootstraps))
+
+
+def _own_recordings(
+    series: Sequence[Responses], policy: Policy | None, at_min: float | None
+) -> tuple[Sequence[Responses], tuple[Finding, ...]]:
+    """The recordings without those before a policy's first one, and a note on these; all if no others are left.
+
+    All too if an earlier minute is asked for.
+    """
+    own_min = min(policy.recorded_at_min[:1], default=-np.inf) if policy is not None else -np.inf
+    own = [each for each in series if each.start_min >= own_min]
+    older = len(series) - len(own)
+    if not older or not own or (at_min is not None and at_min < own_min):
+        return series, ()
+    what = f"not used: {counted(older, 'recording')} before that at {in_min(own_min)}, the policies' first one"
+    return own, (Finding("older-recordings", "note", what, float(older)),)
+
+
+def _last_minute(timeline: SimulatorTimeline, policy: Policy | None) -> float:
+    """The minute of the last simulator that a policy was trained on; of the last recording without a policy."""
+    first_min, last_min = (float(timeline.start_min[i]) for i in (0, -1))
+    if policy is None:
+        return last_min
+    trained_until = policy.trained_until_min(first_min)
+    return first_min if trained_until is None else trained_until
 
 
 def reread(responses: Responses, adjusted: AdjustedRanks) -> Responses:

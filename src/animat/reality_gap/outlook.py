@@ -73,7 +73,7 @@ def outlook(
     account: Account,
     age_min: float,
 ) -> Outlook:
-    """How long a session will be and can be, that much later than the recording.
+    """How long a session will be and can be, `age_min` after the recording.
 
     `episodes` has for each agent the number of episodes, how often each condition is presented in one of them, and
     whether the culture gets pulses.

@@ -66,7 +66,7 @@ class Prediction(NamedTuple):
         return np.asarray(self.commanded.presented / self.returns.size)
 
     def of_start(self, number: int) -> Prediction:
-        """The same from one of the starts; what is commanded is of all."""
+        """The same for one of the starts; its commands are still those from all starts."""
         one = slice(number, number + 1)
         return self._replace(returns=self.returns[one], bootstrap_means=self.bootstrap_means[:, one])
 
@@ -135,15 +135,23 @@ def predict(
             if number:
                 rows = {control.name: [*range(control.actor.n_actors)]}
             for name, of in rows.items():
-                each = CommandSums(presented[:, of], total[:, of]).summed(1)
-                from_starts = returns[:, of].reshape(len(returns), -1, rounds)
-                predictions[name] = Prediction(
-                    from_starts[:ROLL_OUTS].reshape(-1, rounds).T,
-                    from_starts[ROLL_OUTS:].mean(axis=1),
-                    CommandSums(*(sums[:ROLL_OUTS] for sums in each)).summed(0),
-                    CommandSums(*(sums[ROLL_OUTS:] for sums in each)),
-                )
+                commanded = CommandSums(presented[:, of], total[:, of])
+                predictions[name] = _prediction(returns[:, of], commanded, rounds)
     return predictions
+
+
+def _prediction(
+    returns: Float64[np.ndarray, "roll_outs actors episodes"], commanded: CommandSums, rounds: int
+) -> Prediction:
+    """From roll-outs of an agent's actors: the first on the recording's simulator, each other one on a bootstrap."""
+    from_starts = returns.reshape(len(returns), -1, rounds)
+    each = commanded.summed(1)
+    return Prediction(
+        from_starts[:ROLL_OUTS].reshape(-1, rounds).T,
+        from_starts[ROLL_OUTS:].mean(axis=1),
+        CommandSums(*(sums[:ROLL_OUTS] for sums in each)).summed(0),
+        CommandSums(*(sums[ROLL_OUTS:] for sums in each)),
+    )
 
 
 def episodes_on_host(robot: Robot[Any]) -> int:
@@ -172,7 +180,7 @@ def roll_out_seed(seed: int, group: int, on: int) -> int:
 
 
 def _with_random_actor(control: Control) -> Control:
-    """With random choices if they have no effect: without stimuli, or if the delivered condition is random anyway."""
+    """The control with a random actor where choices have no effect: without stimuli, or with shuffled delivery."""
     if control.delivery not in ("silent", "shuffled"):
         return control
     delivery: Delivered = "silent" if control.delivery == "silent" else "chosen"

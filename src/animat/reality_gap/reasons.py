@@ -181,11 +181,11 @@ def answers(evidence: Evidence) -> Finding | None:
             )
             differences[text] = difference
     if not differences and len(conditions):
-        return _offset(evidence, conditions, level)
+        return _command_offset(evidence, conditions, level)
     return _note("answers", "conditions lead to different mean commands than predicted: {}", differences)
 
 
-def _offset(evidence: Evidence, conditions: Int64[np.ndarray, " conditions"], level: float) -> Finding | None:
+def _command_offset(evidence: Evidence, conditions: Int64[np.ndarray, " conditions"], level: float) -> Finding | None:
     """The mean difference of all commands from the mean that is predicted for their conditions, on each readout."""
     measured, predicted = evidence.session.commanded, evidence.predicted
     responses, names = evidence.session.responses, evidence.session.responses.readouts.names

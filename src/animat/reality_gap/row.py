@@ -85,7 +85,7 @@ class Row:
         returns, chance = self.measured, self.predicted
         if self.expected is not None:
             returns, chance = returns - self.expected + expected, chance.reshape(len(returns), -1)
-            # From each start a mean over few episodes, from which they differ too little.
+            # Few episodes differ too little from their own mean: widen their spread to that of a sample (Bessel).
             wider = np.sqrt(chance.shape[1] / max(chance.shape[1] - 1, 1))
             chance = ((chance - self.expected[:, None]) * wider).ravel() + expected
         drawn = resampled_means(returns, rng := np.random.default_rng(0), self.turn)
@@ -95,7 +95,7 @@ class Row:
         # Episodes of a turn count once if they go alike, or if all go alike, and each by itself if they do not.
         independent = int(np.clip(returns.var() / max(drawn.var(), 1e-12), fewest, len(self.measured)))
         missed = expected - rng.choice(chance, (len(drawn), independent)).mean(axis=1)
-        # A robot of one's own may return more than it says.
+        # A user's robot may exceed the range of returns that it states.
         limits = min(self.within[0], self.measured.min()), max(self.within[1], self.measured.max())
         measured = np.clip(mean + missed if missed.std() > drawn.std() else drawn, *limits)
         return bootstrap_interval(mean - expected, measured - rng.choice(self.bootstrap_means, len(drawn)))

@@ -5,19 +5,20 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
-from typing import Any
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from typing import Any, Self, TypeVar
 
 import numpy as np
+from jaxtyping import Float64
 
 from animat.arguments import checked_arguments
 from animat.closed_loop.agents import Agent, Greedy, agent_of
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.runner import starts_of
 from animat.closed_loop.running import check_session, run_session
-from animat.closed_loop.session import Session, expect_no_session
-from animat.coding.encoder import electrode_pulses
+from animat.closed_loop.session import expect_no_session
 from animat.cultures.base import Culture
 from animat.cultures.budget import Account
 from animat.cultures.failures import describe_error
@@ -30,16 +31,15 @@ from animat.evaluation.controls import RANDOM, Control, controls_of, coupling_of
 from animat.evaluation.optimal_returns import too_few
 from animat.evaluation.optimum import optimal_values
 from animat.evaluation.own_agents import controls_of_own
-from animat.evaluation.rollouts import Actor, networks_of
-from animat.evaluation.statistics import compare_episodes
-from animat.goals.tally import Outcome
+from animat.evaluation.rollouts import Actor, Networks, networks_of
+from animat.neurons.simulator import NeuronSimulator
 from animat.progress import Progress, in_phase
 from animat.reality_gap.calibration import Calibration
-from animat.reality_gap.outlook import outlook
-from animat.reality_gap.predicting import EPISODES, MOST_ON_HOST, Prediction, few_predicted, pool, predict
+from animat.reality_gap.measuring import session_rows
+from animat.reality_gap.outlook import Outlook, outlook
+from animat.reality_gap.predicting import EPISODES, MOST_ON_HOST, few_predicted, pool, predict
 from animat.reality_gap.reasons import Evidence, reasons
-from animat.reality_gap.row import Row
-from animat.reality_gap.session_responses import outcomes, read_responses
+from animat.reality_gap.session_responses import read_responses
 from animat.reality_gap.table import INTERVENTION_EPISODES, RealityGap, intervention_table
 from animat.recordings.findings import Finding, warnings_once
 from animat.robots.base import Robot, lacking
@@ -49,6 +49,8 @@ from animat.robots.starts import Starts
 from animat.training.policy import Policy, first_of_alike
 from animat.wrappers import NeuralObservation
 from animat.writing import expect_writable
+
+T = TypeVar("T")
 
 FEWEST_OF_A_CONTROL = 5
 """Fewest episodes of a control: enough to show (p < 0.01) that policies with ten or more outperform it."""
@@ -109,84 +111,49 @@ def run_policies(
         Mismatch: if they differ from each other, or from the calibration's conditions.
         UnusableData: for policies without neurons.
     """
-    first = check_policies(policies)
+    representative = check_policies(policies)
     expect_at_least("seed", seed, 0)
     # Before minutes of prediction.
     expect_no_session(folder)
-    transfer.expect_conditions(first, calibration.conditions, calibration.readouts)
-    settings = {"burst_threshold": calibration.burst_threshold, **settings}
-    if calibration.adaptive:
-        settings["adaptive_from"] = calibration.adjusted
-    delivered, unknown = calibration.delivered(culture)
-    if "pulse" in settings:
-        unknown = ()
-    settings = delivered | settings
-    # The recording's conditions have their stimuli: older policies do not know those of patterns.
-    settings["conditions"] = calibration.conditions
-    if first.neural_observation:
-        settings["remembering"] = calibration.remembering
-    loop, findings = Loop.of_policy(first, calibration.percentiles, pulses=pulses, **settings)
+    transfer.expect_conditions(representative, calibration.conditions, calibration.readouts)
+    loop, findings = _loop_of(representative, culture, calibration, pulses, settings)
     age_min, starts = calibration.age_min(culture), _starts(loop.robot, seed, episodes)
-    if calibration.recording is not None:
-        unknown += differences(calibration.recording, culture, patterns_too=loop.encoder.takes_patterns)
     called = [name for name, agent in (agents or {}).items() if not isinstance(agent, Actor)]
-    findings = unknown + findings + tuple(_warnings(first, loop, calibration, age_min, starts, called))
+    findings += tuple(_warnings(representative, loop, calibration, age_min, starts, called))
     account = account or Account()
-    animat = Animat(loop.robot, loop.mapping, len(loop.conditions))
-    environment: Environment[Any] = NeuralObservation(animat) if first.neural_observation else animat
-    simulator = calibration.simulator
-    networks = networks_of(list(policies.values()), greedy=greedy)
-    trained, controls = Control("policies", "as trained", networks), [RANDOM]
-    lacks = lacking(loop.robot)
+    simulation = _Simulation.of(policies, loop, calibration, greedy=greedy, seed=seed, starts=starts)
+    controls = [RANDOM]
     if with_controls:
-        if "heuristic" in lacks:
+        if "heuristic" in (lacks := lacking(loop.robot)):
             findings += (Finding("no-heuristic", "note", lacks["heuristic"]),)
-        labels = [condition.label for condition in loop.conditions]
-        controls = controls_of(environment, simulator, labels, networks)
-        # The heuristic stays last: random numbers depend on the place.
-        controls.sort(key=lambda control: control.name == "heuristic")
+        controls = simulation.controls([condition.label for condition in loop.conditions])
     if with_coupling:
         in_phase(progress, "best coupling").update(0, 1, "searching on the simulator")
-        controls.append(coupling_of(environment, simulator, seed=seed))
+        controls.append(coupling_of(*simulation.within, seed=seed))
     ideal = None
     if with_interventions:
-        if isinstance(loop.robot, HostRobot):
-            raise InvalidArgument(
-                f"--interventions: expected a robot in JAX, got {loop.robot.name}, which is stepped outside JAX"
-            )
-        simulated: dict[str, Any] = {"episodes": INTERVENTION_EPISODES, "seed": seed, "starts": starts}
-        half_way = trained.run(environment, simulator, **simulated).half_way
-        actuator, *changed = interventions_of(environment, simulator, networks, switch_at=half_way)
-        ideal = actuator, actuator.run(environment, simulator, **simulated).returns.ravel()
-        controls += [each for each in changed if each.name not in ("silent", "shuffled")]
-    own = controls_of_own(agents or {}, environment, simulator, [*policies, *(control.name for control in controls)])
+        interventions, ideal = simulation.interventions()
+        controls += interventions
+    own = controls_of_own(agents or {}, *simulation.within, [*policies, *(control.name for control in controls)])
     acting = {name: Greedy(policy) if greedy else policy for name, policy in policies.items()}
-    pooled = np.concatenate(calibration.responses_hz)
-    taking_turns = [Agent(name, trained.meaning, controller) for name, controller in acting.items()]
-    taking_turns += [agent_of(control, animat, acting, pooled) for control in (*controls, *own)]
+    taking_turns = simulation.agents(acting, (*controls, *own), calibration)
 
     of_each = planned_episodes(len(policies), len(controls), episodes) + [episodes] * len(own)
     check_session(culture, loop, taking_turns, of_each, seed)
 
-    # The optimal return meanwhile, on another core: a session must not wait for one.
-    thread = ThreadPoolExecutor(1)
-    computed = thread.submit(_optimal_return, animat, calibration, starts)
-    try:
+    # On another core: a session must not wait for the optimal return.
+    with _meanwhile(lambda: _optimal_return(simulation.animat, calibration, starts)) as computed:
         predicted = predict(
-            trained,
+            simulation.trained,
             tuple(policies),
             (*controls, *own),
-            environment,
+            simulation.environment,
             # Fixed thresholds stay the same in bootstraps; adaptive ones would adapt to their responses.
-            calibration if calibration.adaptive else calibration.with_percentiles(simulator.percentiles),
+            calibration if calibration.adaptive else calibration.with_percentiles(simulation.simulator.percentiles),
             seed=seed,
             starts=starts,
             progress=in_phase(progress, "predicting"),
         )
-    except Exception:
-        # A program that exits while JAX computes is killed by a signal. A user who interrupts does not wait.
-        thread.shutdown()
-        raise
     optimum, why_none = computed.result()
     plan = [
         (n, predicted[each.name].presented, each.delivery != "silent")
@@ -196,10 +163,7 @@ def run_policies(
     findings = (*noticed, *findings, *why_none, *calibration.findings)
     if report is not None:
         # Before the first pulse, so that the operator can still stop.
-        for message in warnings_once(findings):
-            report(f"warning: {message}")
-        report(f"each pulse: {loop.pulse}")
-        report(f"{'warning: ' if expected.budget_min < expected.settling_min else ''}{expected}")
+        _report(report, findings, loop, expected)
     expect_writable(folder, room_bytes=expected.room_bytes)
     session = run_session(
         culture,
@@ -212,7 +176,7 @@ def run_policies(
         progress=in_phase(progress, "closed loop", sum(of_each), "episodes"),
         predicted={name: of.interval for name, of in predicted.items()},
     )
-    rows = _rows(taking_turns, tuple(policies), predicted, session, loop, first.pulse_cost, starts)
+    rows = session_rows(session, taking_turns, tuple(policies), predicted, loop, representative.pulse_cost, starts)
     gap_reasons: tuple[Finding, ...] = ()
     if sign := rows[0].gap_sign:
         responses = read_responses(session, loop, tuple(policies))
@@ -230,21 +194,128 @@ def run_policies(
         reasons=gap_reasons,
         whose_work=() if ideal is None else intervention_table(rows, *ideal),
     )
+    return _written(gap)
+
+
+def _loop_of(
+    policy: Policy, culture: Culture, calibration: Calibration, pulses: int | None, settings: dict[str, Any]
+) -> tuple[Loop, tuple[Finding, ...]]:
+    """The loop for a policy, and its differences from the recording and from the policy.
+
+    `settings` replace those that the calibration gives.
+    """
+    delivered, unknown = calibration.delivered(culture)
+    if "pulse" in settings:
+        unknown = ()
+    settings = {"burst_threshold": calibration.burst_threshold} | delivered | settings
+    # The recording's conditions have their stimuli: older policies do not know those of patterns.
+    settings["conditions"] = calibration.conditions
+    if calibration.adaptive:
+        settings["adaptive_from"] = calibration.adjusted
+    if policy.neural_observation:
+        settings["remembering"] = calibration.remembering
+    loop, unlike_policy = Loop.of_policy(policy, calibration.percentiles, pulses=pulses, **settings)
+    if calibration.recording is not None:
+        unknown += differences(calibration.recording, culture, patterns_too=loop.encoder.takes_patterns)
+    return loop, unknown + unlike_policy
+
+
+@dataclass(frozen=True, eq=False)
+class _Simulation:
+    """The trained policies, and the simulator of the calibrating recording, on which controls are prepared."""
+
+    trained: Control
+    networks: Networks
+    animat: Animat[Any]
+    environment: Environment[Any]
+    simulator: NeuronSimulator
+    seed: int
+    starts: Starts | None
+
+    @classmethod
+    def of(
+        cls,
+        policies: Mapping[str, Policy],
+        loop: Loop,
+        calibration: Calibration,
+        *,
+        greedy: bool,
+        seed: int,
+        starts: Starts | None,
+    ) -> Self:
+        animat = Animat(loop.robot, loop.mapping, len(loop.conditions))
+        sees_neurons = next(iter(policies.values())).neural_observation
+        environment: Environment[Any] = NeuralObservation(animat) if sees_neurons else animat
+        networks = networks_of(list(policies.values()), greedy=greedy)
+        trained = Control("policies", "as trained", networks)
+        return cls(trained, networks, animat, environment, calibration.simulator, seed, starts)
+
+    @property
+    def within(self) -> tuple[Environment[Any], NeuronSimulator]:
+        return self.environment, self.simulator
+
+    def controls(self, labels: Sequence[str]) -> list[Control]:
+        """All controls; the heuristic stays last, as random numbers depend on the place."""
+        return sorted(controls_of(*self.within, labels, self.networks), key=lambda control: control.name == "heuristic")
+
+    def interventions(self) -> tuple[list[Control], tuple[Control, Float64[np.ndarray, " episodes"]]]:
+        """The interventions that a loop can run, and the ideal actuator with its returns on the simulator."""
+        if isinstance(robot := self.environment.robot, HostRobot):
+            got = f"{robot.name}, which is stepped outside JAX"
+            raise InvalidArgument(f"--interventions: expected a robot in JAX, got {got}")
+        simulated: dict[str, Any] = {"episodes": INTERVENTION_EPISODES, "seed": self.seed, "starts": self.starts}
+        half_way = self.trained.run(*self.within, **simulated).half_way
+        actuator, *changed = interventions_of(*self.within, self.networks, switch_at=half_way)
+        returns = actuator.run(*self.within, **simulated).returns.ravel()
+        # The other two are controls already.
+        return [each for each in changed if each.name not in ("silent", "shuffled")], (actuator, returns)
+
+    def agents(
+        self, policies: Mapping[str, Controller], controls: Sequence[Control], calibration: Calibration
+    ) -> list[Agent]:
+        """Those that take turns in the loop: the policies, then the controls."""
+        pooled = np.concatenate(calibration.responses_hz)
+        own = [Agent(name, self.trained.meaning, controller) for name, controller in policies.items()]
+        return own + [agent_of(control, self.animat, policies, pooled) for control in controls]
+
+
+@contextmanager
+def _meanwhile(compute: Callable[[], T]) -> Iterator[Future[T]]:
+    """Compute in another thread while the block runs."""
+    thread = ThreadPoolExecutor(1)
+    computed = thread.submit(compute)
+    try:
+        yield computed
+    except Exception:
+        # A program that exits while JAX computes is killed by a signal. A user who interrupts does not wait.
+        thread.shutdown()
+        raise
+
+
+def _report(report: Callable[[str], None], findings: Sequence[Finding], loop: Loop, expected: Outlook) -> None:
+    for message in warnings_once(findings):
+        report(f"warning: {message}")
+    report(f"each pulse: {loop.pulse}")
+    report(f"{'warning: ' if expected.budget_min < expected.settling_min else ''}{expected}")
+
+
+def _written(gap: RealityGap) -> RealityGap:
+    """Write the table; if that fails, the session's ending says so, and the table can still be printed."""
     try:
         gap.write()
     except InvalidFile as error:
-        # It can still be printed.
-        ending = replace(session.ending, message=f"{session.ending.message}; {error}")
+        session, ending = gap.session, gap.session.ending
+        ending = replace(ending, message=f"{ending.message}; {error}")
         return replace(gap, session=replace(session, ending=ending))
     return gap
 
 
 def _warnings(
-    first: Policy, loop: Loop, calibration: Calibration, age_min: float, starts: Starts | None, called: Sequence[str]
+    policy: Policy, loop: Loop, calibration: Calibration, age_min: float, starts: Starts | None, called: Sequence[str]
 ) -> Iterator[Finding]:
     """Known reasons why the measured return may differ from the prediction."""
-    yield from transfer.other_calibration(first.presentation, calibration.presentation)
-    if first.delivery == "shuffled":
+    yield from transfer.other_calibration(policy.presentation, calibration.presentation)
+    if policy.delivery == "shuffled":
         message = (
             "the policies were trained as a control, with conditions drawn at random whatever they chose; this loop "
             "delivers what they choose"
@@ -257,14 +328,14 @@ def _warnings(
             "measured return may differ from the prediction"
         )
         yield Finding("no-warm-up", "warning", message)
-    if calibration.adaptive and first.percentiles == "first":
+    if calibration.adaptive and policy.percentiles == "first":
         message = (
             "the policies were trained with fixed thresholds, but in this loop thresholds adapt to the culture: use "
             "--thresholds fixed to have them as in training"
         )
         yield Finding("moving-percentiles", "warning", message)
-    yield from transfer.other_simulator(first.fitted, calibration.fitted)
-    yield from transfer.other_culture(first.culture, calibration.culture)
+    yield from transfer.other_simulator(policy.fitted, calibration.fitted)
+    yield from transfer.other_culture(policy.culture, calibration.culture)
     yield from transfer.faster_than_recorded(calibration.recording, loop.conditions)
     yield from transfer.old_calibration(age_min, "this session")
     yield from transfer.no_memory(calibration.findings, calibration.presentation, has_memory=has_memory)
@@ -315,65 +386,3 @@ def check_policies(policies: Mapping[str, Policy]) -> Policy:
     if first.mapping is None:
         raise UnusableData("policies: expected some that act through neurons, got some that were trained without")
     return max(policies.values(), key=lambda policy: policy.trained_until_min(0.0) or 0.0)
-
-
-def _rows(
-    agents: Sequence[Agent],
-    names: tuple[str, ...],
-    predicted: Mapping[str, Prediction],
-    session: Session,
-    loop: Loop,
-    pulse_cost: float,
-    starts: Starts | None,
-) -> tuple[Row, ...]:
-    goal_outcomes, of_trials = outcomes(loop.robot, session), electrode_pulses(loop.conditions, loop.pulses)
-    unstimulated = {agent.name for agent in agents if agent.delivery == "silent"}
-    of_agents = {agent.name: [each.number for each in session.episodes if each.agent == agent.name] for agent in agents}
-    is_drawn = starts is not None or len({episode.start for episode in session.episodes}) > 1
-    turn_of = {number: turn for numbers in of_agents.values() for turn, number in enumerate(numbers)}
-
-    def row(name: str, meaning: str, of: Sequence[str]) -> Row:
-        episodes = [episode for episode in session.episodes if episode.agent in of]
-        whole = [each for each in episodes if each.is_whole]
-        actions = max(1, sum(each.iterations for each in episodes))
-        trials = max(1, sum(each.trials for each in episodes))
-        every = pooled = pool([predicted[each] for each in of])
-        turn = expected = None
-        if is_drawn:
-            turn = np.array([turn_of[each.number] for each in whole], np.int64)
-            if whole and starts is not None:
-                pooled = pool([predicted[each.agent].of_start(turn_of[each.number]) for each in whole])
-                expected = pooled.returns.reshape(len(whole), -1).mean(axis=1)
-        met = [goal_outcomes[episode.number] for episode in episodes if episode.number in goal_outcomes]
-        return Row(
-            name=name,
-            meaning=meaning,
-            predicted=pooled.returns.ravel(),
-            bootstrap_means=pooled.bootstrap_means.mean(axis=1),
-            measured=np.array([episode.total for episode in whole], np.float64),
-            pulses_per_action=sum(each.pulses - each.warm_up_pulses for each in episodes) / actions,
-            electrode_pulses=sum(each.electrode_pulses for each in whole) / len(whole) if whole else math.nan,
-            predicted_electrode_pulses=None
-            if of_trials is None
-            else float(every.presented @ of_trials) * (name not in unstimulated),
-            pulse_cost=pulse_cost,
-            bursts=sum(each.bursts for each in episodes) / trials,
-            late=sum(each.late for each in episodes) / trials,
-            met=Outcome(*map(np.stack, zip(*met, strict=True))).means() if met else {},  # type: ignore[arg-type]
-            within=loop.robot.return_range,
-            turn=turn,
-            expected=expected,
-            from_all_starts=float(every.returns.mean()),
-        )
-
-    policies = row("policies" if len(names) > 1 else names[0], "as trained", names)
-    rows = [policies]
-    # The policies come first; a single one has its row already.
-    for agent in agents if len(names) > 1 else agents[1:]:
-        own = row(agent.name, agent.meaning, [agent.name])
-        # With a different goal in mid-episode policies should do equally well: there is nothing to outperform.
-        is_compared = agent.name not in names and agent.switch_at is None
-        if is_compared and len(own.measured) and len(policies.measured):
-            own = replace(own, comparison=compare_episodes(policies.measured, own.measured))
-        rows.append(own)
-    return tuple(rows)

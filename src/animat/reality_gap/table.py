@@ -147,22 +147,8 @@ class RealityGap:
 
     def to_text(self) -> str:
         """A table for a terminal."""
-        cells, objectives, cost = [], objectives_of(self.loop.robot), self.rows[0].pulse_cost
-        for row in self.rows:
-            fields, prediction = row.to_dict(), row.prediction
-            measured = ["-", "-", ""]
-            if (gap := fields["gap"]) is not None:
-                ends = "unknown" if gap["low"] is None else f"{gap['low']:+z.1f} to {gap['high']:+z.1f}"
-                measured = [f"{fields['measured']:.1f}", f"{gap['value']:+z.1f}", ends]
-            p = "" if row.comparison is None else f"{row.comparison.p_best:.2g}"
-            counts = [
-                *(cells_of(row.met) if objectives else []),
-                str(len(row.measured)),
-                f"{row.pulses_per_action:.1f}",
-                f"{row.electrode_pulses:.1f}" if len(row.measured) else "-",
-                *(["-" if net is None else f"{net:.1f}" for net in (row.predicted_net, row.net)] if cost else []),
-            ]
-            cells.append([row.name, f"{fields['predicted']:.1f}", prediction.ends, *measured, *counts, p, row.meaning])
+        objectives, cost = objectives_of(self.loop.robot), self.rows[0].pulse_cost
+        cells = [_cells(row, has_objectives=bool(objectives), has_cost=bool(cost)) for row in self.rows]
         interval = "its 95 % interval"
         head = ["", "predicted", interval, "measured", "gap", interval, *(MEANS if objectives else ()), "episodes"]
         head += ["pulses/action", "electrode pulses", *(("predicted net", "net") if cost else ()), "p value", "meaning"]
@@ -201,6 +187,23 @@ class RealityGap:
         return "\n".join(lines)
 
 
+def _cells(row: Row, *, has_objectives: bool, has_cost: bool) -> list[str]:
+    """A row of the table, with columns for objectives and cost where there are any."""
+    fields, measured = row.to_dict(), ["-", "-", ""]
+    if (gap := fields["gap"]) is not None:
+        ends = "unknown" if gap["low"] is None else f"{gap['low']:+z.1f} to {gap['high']:+z.1f}"
+        measured = [f"{fields['measured']:.1f}", f"{gap['value']:+z.1f}", ends]
+    counts = [
+        *(cells_of(row.met) if has_objectives else []),
+        str(len(row.measured)),
+        f"{row.pulses_per_action:.1f}",
+        f"{row.electrode_pulses:.1f}" if len(row.measured) else "-",
+        *(["-" if net is None else f"{net:.1f}" for net in (row.predicted_net, row.net)] if has_cost else []),
+    ]
+    p = "" if row.comparison is None else f"{row.comparison.p_best:.2g}"
+    return [row.name, f"{fields['predicted']:.1f}", row.prediction.ends, *measured, *counts, p, row.meaning]
+
+
 def intervention_table(rows: Sequence[Row], ideal: Control, with_ideal: Returns) -> tuple[Intervention, ...]:
     """The table: the simulator, an ideal actuator with its returns on it, then the measured interventions.
 
@@ -209,13 +212,13 @@ def intervention_table(rows: Sequence[Row], ideal: Control, with_ideal: Returns)
     if not len(rows[0].measured):
         return ()
     measured = {row.name: row for row in rows if len(row.measured)}
-    lost = _lost(rows[0], with_ideal, None)
+    lost = _loss(rows[0], with_ideal, None)
     table = [
         Intervention("its simulator", "as predicted", False, float(rows[0].predicted.mean()), rows[0].gap),
         Intervention(ideal.name, ideal.meaning, False, float(with_ideal.mean()), lost),
     ]
     for row in (measured[name] for name in _INTERVENTIONS if name in measured):
-        lost = _lost(rows[0], row.from_mean_start, row.turn)
+        lost = _loss(rows[0], row.from_mean_start, row.turn)
         table.append(Intervention(row.name, row.meaning, True, float(row.measured.mean()), lost))
     return tuple(table)
 
@@ -233,7 +236,7 @@ def _intervention_lines(policies: Row, table: Sequence[Intervention]) -> list[st
     ]
 
 
-def _lost(usual: Row, changed: Returns, turn: Turns | None) -> Interval:
+def _loss(usual: Row, changed: Returns, turn: Turns | None) -> Interval:
     """Difference of means, with its interval over episodes (`resampled_means`); infinite where they are too few.
 
     Both are as if from the starts of all rounds (`Row.from_mean_start`), as some agents may have had fewer.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -69,17 +69,9 @@ class PlainColumns:
             if width > LONGEST_TEXT:
                 raise UnusableData(f"{name}: expected names of at most {LONGEST_TEXT:,} characters, got {width:,}")
         noted = [*findings]
-        spike_time_s, in_time = _in_time("spike_time_s", self.spike_time_s, "spikes", noted)
-        stimulus_time_s, stimuli_in_time = _in_time("stimulus_time_s", self.stimulus_time_s, "stimuli", noted)
-        # Events that passed each other on their way to a file are closer together.
-        each = (np.asarray(times_s, np.float64) for times_s in (self.spike_time_s, self.stimulus_time_s))
-        n, of_stimuli = (int(np.count_nonzero(np.diff(times_s) < -1.0)) for times_s in each)
-        if 0 < n == of_stimuli:
-            message = (
-                f"times of spikes and of stimuli both go back by more than 1 s, {n:,} of each: if these are "
-                "several recordings in one file, their events are mixed now; convert each by itself (--start-min)"
-            )
-            noted.append(Finding("times-go-back", "warning", message, float(n)))
+        spike_time_s, in_time = _sorted_times("spike_time_s", self.spike_time_s, "spikes", noted)
+        stimulus_time_s, stimuli_in_time = _sorted_times("stimulus_time_s", self.stimulus_time_s, "stimuli", noted)
+        noted += self._mixed_up()
         channels, rows = self._channels(len(spike_time_s), noted)
         if self.start_s is None:
             noted += late_start(spike_time_s, stimulus_time_s)
@@ -87,18 +79,7 @@ class PlainColumns:
         event_s = np.concatenate([spike_time_s, stimulus_time_s])
         start_s = float(event_s.min(initial=0.0) if self.start_s is None else self.start_s)
         stop_s = float(event_s.max(initial=start_s))
-        presentation = None
-        if self.presentation_order is not None:
-            pulses = self.presentation_pulses
-            if pulses is None:
-                per_trial = np.unique(stimuli.presentation, return_counts=True)[1]
-                pulses = max(1, int(np.bincount(per_trial, minlength=1).argmax()))
-            try:
-                presentation = Presentation(self.presentation_order, pulses)  # type: ignore[arg-type]
-            except InvalidArgument as error:
-                raise UnusableData(f"presentation_{error}") from error
-        elif self.presentation_pulses is not None:
-            raise UnusableData("presentation_order: expected 'blocked' or 'mixed' with presentation_pulses, got none")
+        presentation = self._presentation(stimuli)
         return Recording(
             spike_times_s=spike_time_s,
             spike_channels=rows[in_time],
@@ -115,12 +96,40 @@ class PlainColumns:
             findings=merged(noted),
         )
 
+    def _mixed_up(self) -> Iterator[Finding]:
+        """A finding on times that go back in spikes and stimuli alike."""
+        # By more than 1 s: events that were only written out of order are closer together.
+        each = (np.asarray(times_s, np.float64) for times_s in (self.spike_time_s, self.stimulus_time_s))
+        n, of_stimuli = (int(np.count_nonzero(np.diff(times_s) < -1.0)) for times_s in each)
+        if 0 < n == of_stimuli:
+            message = (
+                f"times of spikes and of stimuli both go back by more than 1 s, {n:,} of each: if these are "
+                "several recordings in one file, their events are mixed now; convert each by itself (--start-min)"
+            )
+            yield Finding("times-go-back", "warning", message, float(n))
+
+    def _presentation(self, stimuli: Stimuli) -> Presentation | None:
+        """How the stimuli were presented; if a trial's pulses are not stated, the most common number of them."""
+        if self.presentation_order is None:
+            if self.presentation_pulses is not None:
+                expected = "'blocked' or 'mixed' with presentation_pulses"
+                raise UnusableData(f"presentation_order: expected {expected}, got none")
+            return None
+        pulses = self.presentation_pulses
+        if pulses is None:
+            per_trial = np.unique(stimuli.presentation, return_counts=True)[1]
+            pulses = max(1, int(np.bincount(per_trial, minlength=1).argmax()))
+        try:
+            return Presentation(self.presentation_order, pulses)  # type: ignore[arg-type]
+        except InvalidArgument as error:
+            raise UnusableData(f"presentation_{error}") from error
+
     def _channels(self, n_spikes: int, noted: list[Finding]) -> tuple[Channels, Int64[np.ndarray, " spikes"]]:
         """The channel table, and the row of each spike in it."""
         values = _column("spike_channel", self.spike_channel, n_spikes, "one channel per spike")
         if nameless := int(np.count_nonzero(values == "" if _is_text(values) else values != values)):
             raise UnusableData(f"spike_channel: expected a channel for each spike, got {nameless} without one")
-        values = _names("spike_channel", values)
+        values = _as_names("spike_channel", values)
         lengths = {}
         for name in ("channel_label", "channel_electrode", "channel_xy_um"):
             if (column := getattr(self, name)) is not None:
@@ -138,7 +147,7 @@ class PlainColumns:
             raise UnusableData(f"channel columns: expected one row per channel in each, got {got}")
         n_channels = next(iter(lengths.values()))
         given = np.arange(n_channels) if self.channel_label is None else np.asarray(self.channel_label)
-        labels = _names("channel_label", given)
+        labels = _as_names("channel_label", given)
         table = _channel_table(labels.astype(np.str_), self.channel_electrode, self.channel_xy_um)
         if self.channel_label is not None and (_is_text(values) or not _is_text(labels)):
             return table, _rows_of(values.astype(np.str_), table.label)
@@ -159,7 +168,7 @@ class PlainColumns:
             column = _column("stimulus_frequency_hz", self.stimulus_frequency_hz, n)
             frequency_hz = _numbers("stimulus_frequency_hz", column)
         if self.stimulus_pattern is not None:
-            pattern = _names("stimulus_pattern", _column("stimulus_pattern", self.stimulus_pattern, n))
+            pattern = _as_names("stimulus_pattern", _column("stimulus_pattern", self.stimulus_pattern, n))
         if _is_text(pattern):
             # The empty name, of an unknown pattern, comes first.
             (_, *listed), number = np.unique(np.append("", pattern), return_inverse=True)
@@ -175,7 +184,7 @@ class PlainColumns:
         if electrodes.ndim != 2 or len(electrodes) != n:
             expected = f"shape ({n}, electrodes), padded with {UNKNOWN}"
             raise UnusableData(f"stimulus_electrodes: expected {expected}, got {electrodes.shape}")
-        whole = _whole("stimulus_electrodes", electrodes)
+        whole = _as_whole_numbers("stimulus_electrodes", electrodes)
         expected = f"electrode numbers, or {UNKNOWN} for none (stimulus_pattern {NOTHING}: nothing was delivered)"
         _expect_electrodes("stimulus_electrodes", whole, expected)
         return whole
@@ -183,7 +192,7 @@ class PlainColumns:
     def _presentations(self, n: int, in_time: Column, noted: list[Finding]) -> Column:
         if self.stimulus_presentation is not None:
             column = _column("stimulus_presentation", self.stimulus_presentation, n)
-            presentations: Column = _whole("stimulus_presentation", column)[in_time]
+            presentations: Column = _as_whole_numbers("stimulus_presentation", column)[in_time]
             unknown = presentations == UNKNOWN
             # `Stimuli` refuses numbers that fall.
             if not np.any(unknown) or np.any(np.diff(presentations[~unknown]) < 0):
@@ -240,7 +249,7 @@ def recorded_span(frames: int, rate_hz: float, *times_s: Column) -> dict[str, fl
     return {"start_s": start_s, "duration_s": stop_s - start_s}
 
 
-def _in_time(name: str, column: Column, events: str, noted: list[Finding]) -> tuple[Column, Column]:
+def _sorted_times(name: str, column: Column, events: str, noted: list[Finding]) -> tuple[Column, Column]:
     """The sorted times and the (stable) order that sorts them; reports times that were out of order."""
     times_s = _numbers(name, np.asarray(column))
     if times_s.ndim != 1:
@@ -271,7 +280,7 @@ def _channel_table(labels: Column, electrode: Column | None, xy_um: Column | Non
     electrodes = np.full(n, UNKNOWN)
     if electrode is not None:
         name = "channel_electrode"
-        electrodes = _whole(name, _column(name, electrode, n, "one electrode per channel"))
+        electrodes = _as_whole_numbers(name, _column(name, electrode, n, "one electrode per channel"))
         _expect_electrodes(name, electrodes, f"electrode numbers, or {UNKNOWN} if they are not known")
     return Channels(label=labels, electrode=electrodes, x_um=xy[:, 0], y_um=xy[:, 1])
 
@@ -305,9 +314,9 @@ def _is_text(column: Column) -> bool:
     return column.dtype.kind in "US"
 
 
-def _names(name: str, column: Column) -> Column:
+def _as_names(name: str, column: Column) -> Column:
     """The column as it is if it is text, otherwise as whole numbers."""
-    return column if _is_text(column) else _whole(name, column)
+    return column if _is_text(column) else _as_whole_numbers(name, column)
 
 
 def _numbers(name: str, column: Column) -> Float64[np.ndarray, "..."]:
@@ -316,7 +325,7 @@ def _numbers(name: str, column: Column) -> Float64[np.ndarray, "..."]:
     return column.astype(np.float64) if column.size else np.empty(column.shape)
 
 
-def _whole(name: str, column: Column) -> Int64[np.ndarray, "..."]:
+def _as_whole_numbers(name: str, column: Column) -> Int64[np.ndarray, "..."]:
     """The column as whole numbers; NaN is `UNKNOWN`."""
     if column.dtype.kind in "iu":
         if column.dtype.kind == "u" and (largest := int(column.max(initial=0))) >= 2**63:

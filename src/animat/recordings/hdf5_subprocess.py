@@ -56,7 +56,7 @@ def _start() -> Process:
     end_reader()
     _reader = Process("plain")
     try:
-        _reader.answer(pickle.dumps((_get_ready, (), {})), START_S)
+        _reader.answer(pickle.dumps((_import_readers, (), {})), START_S)
     except Exception as error:
         is_late = isinstance(error, TimeoutError)
         why = f"not ready after {START_S:g} s, is the machine busy?" if is_late else "is animat fully installed?"
@@ -71,7 +71,7 @@ def end_reader() -> None:
         _reader.end()
 
 
-def _get_ready() -> None:
+def _import_readers() -> None:
     """Import the readers before the time limit of a file starts."""
     from animat.recordings.formats import hdf5_formats  # noqa: F401
 
@@ -80,11 +80,11 @@ def _read(folder: Path, path: Path, part: str | None, stimuli: str | None) -> Re
     from animat.recordings.formats.hdf5_formats import read_hdf5
 
     os.chdir(folder)
-    _limit(path)
+    _limit_resources(path)
     return read_hdf5(path, part=part, stimuli=stimuli)
 
 
-def _limit(path: Path) -> None:
+def _limit_resources(path: Path) -> None:
     """Make the operating system end this process if a file takes too much time or memory."""
     import resource
 
@@ -92,7 +92,7 @@ def _limit(path: Path) -> None:
     used = resource.getrusage(resource.RUSAGE_SELF)
     seconds = used.ru_utime + used.ru_stime + PROCESSOR_S + PROCESSOR_S_PER_MB * size / 1e6
     limits = {resource.RLIMIT_CPU: math.ceil(seconds)}
-    with suppress(FileNotFoundError):  # Only Linux tells, and limits, the memory in use.
+    with suppress(FileNotFoundError):  # Only Linux reports and limits the memory in use.
         in_use = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
         limits[resource.RLIMIT_AS] = in_use + MEMORY_BYTES + MEMORY_PER_BYTE * size
     for kind, limit in limits.items():

@@ -76,7 +76,7 @@ def _stimulus_rows(recording: Recording) -> Iterable[Finding]:
         ratio = len(times_s) / n_spikes
         message = f"{len(times_s):,} stimuli for {n_spikes:,} spikes: are spikes and stimuli swapped?"
         yield Finding("more-stimuli-than-spikes", "refuse" if ratio >= STIMULI_PER_SPIKE else "note", message, ratio)
-    yield from _order(recording)
+    yield from _unlike_stated_order(recording)
     last = recording.stimuli.is_last_of_presentation
     if same := int(np.count_nonzero((np.diff(times_s) == 0) & last[:-1])):
         found = f"{same:,} of {len(times_s):,} stimuli come at exactly the same time as the previous one"
@@ -94,7 +94,7 @@ def _stimulus_rows(recording: Recording) -> Iterable[Finding]:
         yield Finding("trials-of-several-frequencies", "warning", message, float(several))
 
 
-def _order(recording: Recording) -> Iterator[Finding]:
+def _unlike_stated_order(recording: Recording) -> Iterator[Finding]:
     """A finding on trials whose frequencies are not in the stated order; those of a protocol are."""
     frequency_hz = recording.stimuli.frequency_hz[recording.stimuli.is_last_of_presentation]
     frequency_hz = frequency_hz[~np.isnan(frequency_hz)]
@@ -141,10 +141,10 @@ def _on_channels(recording: Recording) -> Iterator[Finding]:
         message = f"channels that fire as no neuron does: {which}; {remedy}"
         yield Finding("noisy-channels", "warning" if share > 0.1 else "note", message, float(len(noisy)))
     yield from _stopped_channels(recording)
-    yield from _positions(recording)
+    yield from _impossible_positions(recording)
 
 
-def _positions(recording: Recording) -> Iterator[Finding]:
+def _impossible_positions(recording: Recording) -> Iterator[Finding]:
     """A finding on positions between which no array has its electrodes."""
     channels = recording.channels
     x_um, y_um = (axis[~np.isnan(axis)] for axis in (channels.x_um, channels.y_um))

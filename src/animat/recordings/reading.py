@@ -112,7 +112,7 @@ def read_source(
                 return read_response_npz(path) or read_npz(path)
             return _read_text(path, begin, stimuli_path)
     except (*DAMAGE, RecursionError, AssertionError) as error:
-        # Errors that no reader anticipated: report them in one line too.
+        # An unexpected error of a reader is also reported in one line.
         raise InvalidFile(f"{path}: expected a recording, but it cannot be read ({first_line(error)})") from error
 
 

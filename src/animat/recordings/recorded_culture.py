@@ -67,7 +67,7 @@ class RecordedCulture:
 
 def names_in(provenance: Mapping[str, str]) -> tuple[tuple[str, str], ...]:
     """The entries of a provenance that identify the culture."""
-    # Spaces at the ends, which nobody sees, and line breaks do not make another name.
+    # Names that differ only in white space are the same.
     known = ((name, " ".join(provenance.get(name, "").split())) for name in NAMES)
     return tuple((name, value) for name, value in known if value.lower() not in _NAMELESS)
 
@@ -78,7 +78,7 @@ def culture_of_series(cultures: Iterable[RecordedCulture | None]) -> RecordedCul
     if not known:
         return None
     known = [culture for culture in known if not known[0].difference(culture)]
-    # What the first states comes last, and counts.
+    # In reverse, so that the names that the first one states prevail.
     values = {name: value for culture in reversed(known) for name, value in culture.names}
     names = tuple((name, values[name]) for name in NAMES if name in values)
     return replace(next((culture for culture in known if culture.kind), known[0]), names=names)

@@ -111,7 +111,7 @@ def _common_factor(stimuli: Stimuli, sampling_rate_hz: float) -> Finding | None:
         multiples = np.array([np.median(multiples) for multiples in multiples_of.values()])
         multiple, lowest_hz = float(np.median(multiples)), min(multiples_of)
         if np.all(np.abs(multiples / multiple - 1) < AGREE) and not 1 / FAR < multiple < FAR:
-            unit = _unit(multiple, sampling_rate_hz)
+            unit = _unit_of_times(multiple, sampling_rate_hz)
             message = (
                 f"stimulus times {'cannot' if unit else 'may not'} be in seconds: those at {lowest_hz:g} Hz would be "
                 f"{multiples[0] / lowest_hz:g} s apart, not {1 / lowest_hz:g} s, and the others are off by the same "
@@ -130,7 +130,7 @@ def _sooner_than_stated(stimuli: Stimuli) -> Iterator[Finding]:
         sooner.append(min(((float(np.median(m)), hz) for hz, m in enough.items()), default=(1.0, 0.0)))
         if _is_regular(enough):
             regular.append(sooner[-1])
-    # If intervals are regular counted in one of the two ways only, this is how frequencies are stated.
+    # If intervals are regular in only one of the two ways of counting, frequencies are stated in that way.
     least, stated_hz = max(sooner) if len(regular) != 1 else regular[0]
     if least > 1 / APART:
         return
@@ -159,7 +159,7 @@ def _is_regular(multiples_of: dict[float, Float64[np.ndarray, " intervals"]]) ->
     return bool(min(of_each) > REGULAR)
 
 
-def _unit(multiple: float, sampling_rate_hz: float) -> str | None:
+def _unit_of_times(multiple: float, sampling_rate_hz: float) -> str | None:
     """The unit of the times and what to do; None if it is unknown."""
     named = {1e3: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds", 1 / 60: "minutes", 1 / 3600: "hours"}
     for factor, unit in named.items():
@@ -207,7 +207,7 @@ def _impossible_firing(recording: Recording) -> str | None:
 
 
 def _unit_of_spikes(median_hz: float, shortest_s: float, sampling_rate_hz: float) -> str:
-    """Units that give rates and shortest intervals typical of neurons, the likeliest first, and what to do."""
+    """The units with which rates and shortest intervals are typical of neurons, the likeliest first, and what to do."""
     is_known = bool(np.isfinite(sampling_rate_hz))
     rate_hz = sampling_rate_hz if is_known else USUAL_SAMPLING_HZ
     units = {

@@ -39,25 +39,32 @@ def draw_headline(rows: Sequence[tuple[Score, Float64[np.ndarray, " policies"]]]
         room = 0.08 * (max(known) - min(known)) or 1.0
         left, right = min(known) - room, max(known) + room
         for place, (row, policies) in enumerate(own):
-            if row.random is not None:
-                axes.plot(row.random, place, "x", color=GREY, markersize=6, label="random actions")
-            if row.optimum is not None:
-                axes.plot([row.optimum] * 2, [place - 0.3, place + 0.3], color=OPTIMUM, label="optimal return")
-            low, high = row.low_95, row.high_95
-            if low is not None and high is not None:
-                ends = np.clip([low, high], left, right)
-                axes.plot(ends, [place] * 2, color=SKY, linewidth=3, label="95 % interval", zorder=1.5)
-                for beyond, end, marker in ((low < left, left, "<"), (high > right, right, ">")):
-                    if beyond:
-                        axes.plot(end, place, marker, color=SKY, markersize=8, clip_on=False)
-            axes.plot(policies, [place + 0.22] * len(policies), "o", color=BLUE, markersize=2.5, label="each policy")
-            axes.plot(row.interquartile_mean, place, "o", color=BLUE, markersize=6, label="their interquartile mean")
+            _draw_score(axes, place, row, policies, left, right)
         axes.set_xlim(left, right)
         axes.set_yticks(range(len(own)), [names[row.arm] for row, _ in own])
         axes.set_ylim(len(own) - 0.5, -0.5)
         axes.grid(axis="x", linewidth=0.4, alpha=0.5)
     add_common_legend(figure, panels, columns=2 if narrow else 3 if n == 1 else 5)
     return figure
+
+
+def _draw_score(
+    axes: Axes, place: int, row: Score, policies: Float64[np.ndarray, " policies"], left: float, right: float
+) -> None:
+    """A row of the headline, on an axis from left to right; `policies` are their mean returns."""
+    if row.random is not None:
+        axes.plot(row.random, place, "x", color=GREY, markersize=6, label="random actions")
+    if row.optimum is not None:
+        axes.plot([row.optimum] * 2, [place - 0.3, place + 0.3], color=OPTIMUM, label="optimal return")
+    low, high = row.low_95, row.high_95
+    if low is not None and high is not None:
+        ends = np.clip([low, high], left, right)
+        axes.plot(ends, [place] * 2, color=SKY, linewidth=3, label="95 % interval", zorder=1.5)
+        for beyond, end, marker in ((low < left, left, "<"), (high > right, right, ">")):
+            if beyond:
+                axes.plot(end, place, marker, color=SKY, markersize=8, clip_on=False)
+    axes.plot(policies, [place + 0.22] * len(policies), "o", color=BLUE, markersize=2.5, label="each policy")
+    axes.plot(row.interquartile_mean, place, "o", color=BLUE, markersize=6, label="their interquartile mean")
 
 
 def draw_over_cultures(rows: Sequence[tuple[OverCultures, Sequence[float]]]) -> Figure:
@@ -125,13 +132,13 @@ def draw_comparisons(pairs: Sequence[Pair], title: str) -> Figure:
         whole.set_ylim(low, high + 0.2 * room)
         for axes, heading in ((whole, f"at {row.at_min:g} min"), (close, "enlarged")):
             axes.set_xlim(-0.6, 1.6)
-            axes.set_xticks([0, 1], [_name(row.first, row.score_first), _name(row.second, row.score_second)])
+            axes.set_xticks([0, 1], [_arm_label(row.first, row.score_first), _arm_label(row.second, row.score_second)])
             style_axes(axes, heading, "", "mean return of a policy")
     add_common_legend(figure, list(rows[0]), columns=2)
     return figure
 
 
-def _name(arm: str, score: float | None) -> str:
+def _arm_label(arm: str, score: float | None) -> str:
     """The arm on two lines or more, and its score on the last."""
     first, _, rest = arm.partition(" ")
     lines = [wrapped(part, _NARROW_IN) for part in (first, rest)]

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float64, Int64
 
 from animat.arguments import checked_arguments
 from animat.errors import InvalidArgument, Mismatch, UnusableData, did_you_mean, in_min
@@ -85,39 +85,28 @@ def extract_responses(
     # A rest has no condition that pulses have too: what is read after it is no response to a stimulus.
     shared = stimuli.is_rest & np.isin(assignment.condition, assignment.condition[~stimuli.is_rest])
     assignment = replace(assignment, condition=np.where(shared, NO_CONDITION, assignment.condition))
-    # Trials without a condition are read too, as the history of others.
-    read, inside = stimuli.is_last_of_presentation, None
     begins, setup_s = _blocks(source)
     assumed: tuple[Finding, ...] = ()
+    inside = None
     if isinstance(source, ResponseTable):
         window_ms, assumed = _window_of(source, by, window_ms)
-        presented, has_times = np.flatnonzero(read), source.has_times
-        scale = 1.0 if source.kind == "rate_hz" else 1 / ((window_ms[1] - window_ms[0]) * 1e-3)
-        rate_hz = source.values[presented].mean(axis=1) * scale
-        active_ratio = np.mean(source.values[presented] > 0, axis=1)
     else:
-        # An end that equals the time of the last stimulus or spike is rounded as that is.
+        # 1e-9: the end of the recording may be the rounded time of its last stimulus or spike.
         inside = stimuli.time_s + window_ms[1] * 1e-3 <= _observed_until_s(source, begins) + 1e-9
-        presented, has_times = np.flatnonzero(read & inside), True
-        rate_hz, active_ratio = read_windows(source, stimuli.time_s[presented], window_ms)
+    # Trials without a condition are read too, as the history of others.
+    is_read = stimuli.is_last_of_presentation
+    presented = np.flatnonzero(is_read if inside is None else is_read & inside)
+    rate_hz, active_ratio = _read(source, presented, window_ms)
     condition = assignment.condition[presented]
     chosen = condition != NO_CONDITION
     bursts = separate_bursts(active_ratio[chosen], burst_threshold, n_channels=n_channels)
-    # There is no silence within a trial, however long it lasts. Rows without times are taken as successive, and nothing
-    # is known about what came before the first.
+    # Silence is measured between pulses: a trial of several, however long, has none. Rows without times are taken as
+    # successive, and nothing is known about what came before the first.
+    has_times = isinstance(source, Recording) or source.has_times
     since_s = np.diff(stimuli.time_s, prepend=-np.inf) + begins * setup_s
     silences = np.cumsum(since_s > SILENCE_S)
     is_rested = (np.diff(silences[presented], prepend=0) > 0) & has_times
     time_s = stimuli.time_s[presented] if has_times else None
-    readout_hz = None
-    if not readouts.are_all:
-        members = readouts.members(source.channels)
-        if isinstance(source, Recording):
-            readout_hz = readouts.read(source, members, stimuli.time_s[presented[chosen]], window_ms)
-        else:
-            values = source.values[presented[chosen]]
-            of_each = np.stack([values[:, group].mean(axis=1) for group in members], axis=-1)
-            readout_hz = readouts.squeeze(of_each * scale)
     responses = Responses(
         condition=condition[chosen],
         rate_hz=rate_hz[chosen],
@@ -139,10 +128,37 @@ def extract_responses(
         culture=source.culture,
         channels=source.channels,
         readouts=readouts,
-        readout_hz=readout_hz,
+        readout_hz=None if readouts.are_all else _read_groups(source, presented[chosen], window_ms, readouts),
         recording=source.without_spikes() if isinstance(source, Recording) else None,
     )
     return replace(responses, findings=(*assumed, *findings_on(responses, source, assignment, bursts, inside)))
+
+
+def _read(
+    source: Recording | ResponseTable, presented: Int64[np.ndarray, " trials"], window_ms: Window
+) -> tuple[Float64[np.ndarray, " trials"], Float64[np.ndarray, " trials"]]:
+    """x of all channels, and the ratio of active ones, after these stimuli."""
+    if isinstance(source, Recording):
+        return read_windows(source, source.stimuli.time_s[presented], window_ms)
+    values = source.values[presented]
+    return values.mean(axis=1) * _hz_per_unit(source, window_ms), np.mean(values > 0, axis=1)
+
+
+def _read_groups(
+    source: Recording | ResponseTable, presented: Int64[np.ndarray, " trials"], window_ms: Window, readouts: Readouts
+) -> Float64[np.ndarray, "trials *readouts"]:
+    """x of each readout after these stimuli."""
+    members = readouts.members(source.channels)
+    if isinstance(source, Recording):
+        return readouts.read(source, members, source.stimuli.time_s[presented], window_ms)
+    values = source.values[presented]
+    of_each = np.stack([values[:, group].mean(axis=1) for group in members], axis=-1)
+    return readouts.squeeze(of_each * _hz_per_unit(source, window_ms))
+
+
+def _hz_per_unit(table: ResponseTable, window_ms: Window) -> float:
+    """What a table's values are multiplied by to be in Hz."""
+    return 1.0 if table.kind == "rate_hz" else 1 / ((window_ms[1] - window_ms[0]) * 1e-3)
 
 
 def _blocks(source: Recording | ResponseTable) -> tuple[Bool[np.ndarray, " stimuli"], float]:

@@ -157,12 +157,12 @@ def inspect_recording(
     """
     responses = extract_responses(recording, by, window_ms, burst_threshold)
     stimuli, (presented, _) = recording.stimuli, responses.presentations
-    # Of all channels in one window.
+    # Channels times the length of a window.
     window_s = (responses.window_ms[1] - responses.window_ms[0]) * 1e-3 * responses.n_channels
     bursts = response = None
     rate_hz = duration_s = math.nan
     if isinstance(recording, ResponseTable):
-        # What takes times of spikes is not known.
+        # Without spike times, the rest is not known.
         kind, n_spikes = "table", int(recording.values.sum()) if recording.kind == "count" else None
         if recording.has_times and len(stimuli):
             duration_s = float(np.ptp(stimuli.time_s))

@@ -92,7 +92,7 @@ class TwoLinkArm(Robot[ArmState]):
         if nearest_m >= farthest_m:
             lengths = f"{self.lower_length_m:g} m with an upper link of {self.upper_length_m:g} m"
             raise InvalidArgument(f"lower_length_m: expected links similar enough to reach a target, got {lengths}")
-        least, _ = self._inertias_kg_m2
+        least, _ = self._eigenvalues_kg_m2
         if self.damping_n_m_s * self.step_s > STIFFEST * SUBSTEPS * least:
             most = f"{STIFFEST * SUBSTEPS * least / self.damping_n_m_s:.3g} for links so light and joints so damped"
             raise InvalidArgument(f"step_s: expected at most {most}, got {self.step_s:g}")
@@ -229,7 +229,7 @@ class TwoLinkArm(Robot[ArmState]):
         return m1 * l1**2 / 3 + m2 * l1**2 + lower, lower, lower, m2 * l1 * l2 / 2
 
     @property
-    def _inertias_kg_m2(self) -> tuple[float, float]:
+    def _eigenvalues_kg_m2(self) -> tuple[float, float]:
         """The smallest and the largest eigenvalue of M in any position."""
         # Those of a straight arm, where the trace is largest and the determinant smallest.
         m11, m12, m22, coupling = self._inertia
@@ -246,7 +246,7 @@ class TwoLinkArm(Robot[ArmState]):
         and is at most K T^2 / b^2. From rest, sqrt(energy) grows by at most T / sqrt(k) per second. Either way
         |q'|^2 <= 2 energy / k. A margin of 5 % allows for finite steps.
         """
-        least, largest = self._inertias_kg_m2
+        least, largest = self._eigenvalues_kg_m2
         by_time = math.sqrt(2) * self.torque_n_m * self.episode_limit * self.step_s / least
         if not self.damping_n_m_s:
             return 1.05 * by_time + 1e-6

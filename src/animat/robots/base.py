@@ -26,7 +26,7 @@ Transition: TypeAlias = tuple[State, "Float[Array, '']", "Bool[Array, '']"]
 LONGEST_EPISODE = 1_000_000
 """Most iterations of an episode: each has its own random key, drawn before the first."""
 
-# The command line and files have 120.0 for 120.
+# Whole numbers from the command line and files may be floats, 120.0.
 _TO_WHOLE = BeforeValidator(lambda value: int(value) if isinstance(value, float) and value.is_integer() else value)
 Iterations = Annotated[Whole, Field(ge=1, le=LONGEST_EPISODE), _TO_WHOLE]
 Size = Annotated[Number, Field(ge=1e-9, le=1e9)]

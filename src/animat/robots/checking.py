@@ -43,47 +43,8 @@ def check_robot(robot: Robot[Any]) -> None:
 @lru_cache(maxsize=64)
 def _check_compiled(robot: Robot[Any]) -> None:
     """Cached per robot: compiling its episode takes some tenths of a second."""
-    name, observations, noise = type(robot).__name__, len(robot.observation_spec), robot.noise_size
-    heuristic = getattr(robot, "heuristic", None)
-
-    def outputs_of(state: Any, reward: Any) -> tuple[Any, ...]:
-        observation = _call(f"{name}.observe", robot.observe, state)
-        if isinstance(observation, list | tuple):
-            kind = type(observation).__name__
-            raise InvalidArgument(f"{name}.observe: expected an array, as from jnp.stack, got a {kind}")
-        _expect_shape(f"{name}.observe", observation, (observations,), "one number for each of `observation_spec`")
-        values = {}
-        for method, expected, dtype in (("succeeded", "true or false", bool), ("potential", "a number", float)):
-            if (function := getattr(robot, method, None)) is not None:
-                values[method] = _call(f"{name}.{method}", function, state)
-                _expect_shape(f"{name}.{method}", values[method], (), expected, dtype)
-        return state, observation, jnp.asarray(reward, jnp.float32), values.get("potential", 0.0)
-
-    def episode(key: Any) -> Any:
-        first = state = _call(f"{name}.reset", robot.reset, key)
-        if any(jnp.issubdtype(jnp.result_type(leaf), jax.dtypes.prng_key) for leaf in jax.tree.leaves(state)):
-            raise InvalidArgument(f"{name}.reset: expected a state of numbers, got a key: store jax.random.key_data")
-        outputs, commands = [outputs_of(state, 0.0)], []
-        # Commands at both ends and in the middle.
-        for number, u in enumerate(np.linspace(-1.0, 1.0, _STEPS, dtype=np.float32), 1):
-            uniforms, given = jnp.full(noise, 0.5, jnp.float32), jnp.full(robot.command_shape, u)
-            expected = f"it to run under jax.jit with {noise} uniforms (noise_size)"
-            step = _call(f"{name}.advance", robot.advance, uniforms, state, given, expected=expected)
-            if not isinstance(step, tuple) or len(step) != 3:
-                raise InvalidArgument(f"{name}.advance: expected (state, reward, whether it ended), got {shown(step)}")
-            after, reward, ended = step
-            _expect_same_structure(f"{name}.advance", after, state)
-            _expect_shape(f"{name}.advance: reward", reward, (), "a number")
-            _expect_shape(f"{name}.advance: whether it ended", ended, (), "true or false", bool)
-            outputs.append(outputs_of(after, reward))
-            if heuristic is not None:
-                command = _call(f"{name}.heuristic", heuristic, outputs[-1][1])
-                _expect_shape(f"{name}.heuristic", command, robot.command_shape, "a command")
-                commands.append(jnp.asarray(command, jnp.float32))
-            # After its end an episode starts again.
-            is_over = jnp.logical_or(ended, number % robot.episode_limit == 0)
-            state = jax.tree.map(partial(jnp.where, is_over), first, after)
-        return outputs, commands
+    name = type(robot).__name__
+    episode = partial(_checked_episode, robot)
 
     def run(key: Any) -> Any:
         # Traced twice, by functions that JAX takes to be different: a value kept from the first trace fails in the
@@ -110,6 +71,55 @@ def _check_compiled(robot: Robot[Any]) -> None:
             if not np.isclose(number, within, rtol=1e-5, atol=1e-5 * quantity.scale):
                 bounds = f"from {quantity.low:g} to {quantity.high:g}, the bounds of its Quantity"
                 raise InvalidArgument(f"{name}.observe: {quantity.name}: expected {bounds}, got {number:g}")
+
+
+def _checked_episode(robot: Robot[Any], key: Any) -> tuple[list[tuple[Any, ...]], list[Any]]:
+    """A start and a few steps, whose shapes are checked: their `_outputs`, and the commands of the heuristic, if any.
+
+    To be traced by JAX.
+    """
+    name, noise = type(robot).__name__, robot.noise_size
+    heuristic = getattr(robot, "heuristic", None)
+    first = state = _call(f"{name}.reset", robot.reset, key)
+    if any(jnp.issubdtype(jnp.result_type(leaf), jax.dtypes.prng_key) for leaf in jax.tree.leaves(state)):
+        raise InvalidArgument(f"{name}.reset: expected a state of numbers, got a key: store jax.random.key_data")
+    outputs, commands = [_outputs(robot, state, 0.0)], []
+    # Commands at both ends and in the middle.
+    for number, u in enumerate(np.linspace(-1.0, 1.0, _STEPS, dtype=np.float32), 1):
+        uniforms, given = jnp.full(noise, 0.5, jnp.float32), jnp.full(robot.command_shape, u)
+        expected = f"it to run under jax.jit with {noise} uniforms (noise_size)"
+        step = _call(f"{name}.advance", robot.advance, uniforms, state, given, expected=expected)
+        if not isinstance(step, tuple) or len(step) != 3:
+            raise InvalidArgument(f"{name}.advance: expected (state, reward, whether it ended), got {shown(step)}")
+        after, reward, ended = step
+        _expect_same_structure(f"{name}.advance", after, state)
+        _expect_shape(f"{name}.advance: reward", reward, (), "a number")
+        _expect_shape(f"{name}.advance: whether it ended", ended, (), "true or false", bool)
+        outputs.append(_outputs(robot, after, reward))
+        if heuristic is not None:
+            command = _call(f"{name}.heuristic", heuristic, outputs[-1][1])
+            _expect_shape(f"{name}.heuristic", command, robot.command_shape, "a command")
+            commands.append(jnp.asarray(command, jnp.float32))
+        # After its end an episode starts again.
+        is_over = jnp.logical_or(ended, number % robot.episode_limit == 0)
+        state = jax.tree.map(partial(jnp.where, is_over), first, after)
+    return outputs, commands
+
+
+def _outputs(robot: Robot[Any], state: Any, reward: Any) -> tuple[Any, ...]:
+    """A state, with its observation, the reward that led to it, and its potential, if there is one."""
+    name, observations = type(robot).__name__, len(robot.observation_spec)
+    observation = _call(f"{name}.observe", robot.observe, state)
+    if isinstance(observation, list | tuple):
+        kind = type(observation).__name__
+        raise InvalidArgument(f"{name}.observe: expected an array, as from jnp.stack, got a {kind}")
+    _expect_shape(f"{name}.observe", observation, (observations,), "one number for each of `observation_spec`")
+    values = {}
+    for method, expected, dtype in (("succeeded", "true or false", bool), ("potential", "a number", float)):
+        if (function := getattr(robot, method, None)) is not None:
+            values[method] = _call(f"{name}.{method}", function, state)
+            _expect_shape(f"{name}.{method}", values[method], (), expected, dtype)
+    return state, observation, jnp.asarray(reward, jnp.float32), values.get("potential", 0.0)
 
 
 def _expect_grid(what: str, value_grid: Callable[[], Any]) -> None:

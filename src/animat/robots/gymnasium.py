@@ -115,7 +115,7 @@ class GymnasiumRobot(HostRobot):
 
     def body(self, *, with_pictures: bool = False) -> Body:
         module = self.id.rpartition(":")[0]
-        # A file could name any module.
+        # Not imported here: a policy file could name any module.
         if module and module not in sys.modules:
             how = f"import it first (on the command line: --robot {self.name})"
             raise InvalidArgument(f"{self.name}: expected {module} to be imported, got only a policy: {how}")

@@ -31,7 +31,7 @@ def code_at(module: str, place: str, name: str) -> dict[str, str]:
         file = getattr(sys.modules.get(module), "__file__", None) or getattr(find_spec(module), "origin", None)
         parts = [] if file is None else _used_by(place.partition(".")[0], ast.parse(Path(file).read_bytes()))
         if parts:
-            digest = hashlib.sha256(repr(_shape(parts)).encode()).hexdigest()
+            digest = hashlib.sha256(repr(_structure(parts)).encode()).hexdigest()
             return {f"code of {name}": f"sha256 {digest[:16]}"}
     return {}
 
@@ -41,7 +41,7 @@ def _used_by(name: str, module: ast.Module) -> list[ast.stmt]:
     statements = (_Plain().visit(statement) for statement in module.body if not _is_main(statement))
     defines = [(statement, _defined_in(statement)) for statement in statements if statement is not None]
     imported = {name for statement, names in defines if isinstance(statement, _IMPORTS) for name in names}
-    defines = [(statement, names or {*_changed_by(statement)} - imported) for statement, names in defines]
+    defines = [(statement, names or {*_possibly_changed(statement)} - imported) for statement, names in defines]
     wanted, used = [name], {name}
     while wanted:
         current = wanted.pop()
@@ -64,18 +64,18 @@ def _defined_in(statement: ast.stmt) -> set[str]:
         elif isinstance(node, _IMPORTS):
             names |= {(alias.asname or alias.name).partition(".")[0] for alias in node.names}
         elif isinstance(node, ast.Name | ast.Attribute | ast.Subscript) and isinstance(node.ctx, ast.Store):
-            names |= {*_whole(node)}
+            names |= {*_root_name(node)}
     return names
 
 
-def _changed_by(statement: ast.stmt) -> list[str]:
-    """The name of what a method is called of, as it may change it: `GAINS.append(2)`."""
+def _possibly_changed(statement: ast.stmt) -> list[str]:
+    """The name of the object whose method is called, which may change it: `GAINS.append(2)`."""
     call = statement.value if isinstance(statement, ast.Expr) else None
-    return _whole(call.func) if isinstance(call, ast.Call) and isinstance(call.func, ast.Attribute) else []
+    return _root_name(call.func) if isinstance(call, ast.Call) and isinstance(call.func, ast.Attribute) else []
 
 
-def _whole(part: ast.expr) -> list[str]:
-    """The name of what something is a part of: of `Rover.gain` and `GAINS[0]`, the rover and the gains."""
+def _root_name(part: ast.expr) -> list[str]:
+    """The name at the root of an expression: `Rover` of `Rover.gain`, `GAINS` of `GAINS[0]`."""
     while isinstance(part, ast.Attribute | ast.Subscript):
         part = part.value
     return [part.id] if isinstance(part, ast.Name) else []
@@ -86,14 +86,14 @@ def _is_main(statement: ast.stmt) -> bool:
     return isinstance(statement, ast.If) and ast.unparse(statement.test).startswith("__name__ ==")
 
 
-def _shape(node: Any) -> Any:
+def _structure(node: Any) -> Any:
     """A syntax tree as nested tuples that are the same in every version of Python: without fields that are empty."""
     if isinstance(node, list):
-        return tuple(map(_shape, node))
+        return tuple(map(_structure, node))
     if not isinstance(node, ast.AST):
         return node
     known = ((name, value) for name, value in ast.iter_fields(node) if value not in (None, []))
-    return type(node).__name__, *((name, _shape(value)) for name, value in known)
+    return type(node).__name__, *((name, _structure(value)) for name, value in known)
 
 
 class _Plain(ast.NodeTransformer):

@@ -130,7 +130,7 @@ class SwingUp(Robot[SwingUpState]):
         gravity = max(self._gravity_per_s2, 1e-9)
         energy = angular_velocity**2 / 2 + gravity * (cosine - 1)
         direction = xp.where(angular_velocity >= 0, 1.0, -1.0)
-        # With exactly the energy needed to stand, the last bit of the way would take for ever.
+        # With some energy to spare: with exactly enough to stand, the pole would take for ever to get there.
         pumping = xp.where(energy < SPARE * gravity, direction, -direction)
         falling = sine + angular_velocity / math.sqrt(gravity)
         held = min(self._push_per_s2 / gravity, 1.0)
@@ -141,7 +141,7 @@ class SwingUp(Robot[SwingUpState]):
         """Angle by angular velocity, computed for every command, as a command may decide whether a step is rewarded."""
         fastest = self.speed_limit_rad_per_s
         return Grid(
-            # Each of the two affects how the other moves, as a grid's first coordinate may not.
+            # A grid's first coordinate must not affect the others, and both of these do: add a dummy.
             Axis("nothing", "1", 0.0, 1.0, TAPS),
             (
                 Axis("angle", "rad", -math.pi, math.pi, 180, periodic=True),

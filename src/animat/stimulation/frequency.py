@@ -18,7 +18,7 @@ def distinct(frequency_hz: Float64[np.ndarray, " pulses"]) -> list[float]:
     found: list[float] = []
     for known_hz in np.unique(frequency_hz[~np.isnan(frequency_hz)]).tolist():
         if found and is_same(known_hz, found[-1]):
-            # In every recording of a series the same number.
+            # Rounded, so that it is the same number in every recording of a series.
             found[-1] = float(f"{found[-1]:.9g}")
         else:
             found.append(known_hz)

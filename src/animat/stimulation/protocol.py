@@ -98,7 +98,7 @@ class Protocol:
     pulse: Annotated[Pulse, BeforeValidator(Pulse.from_list)] = PUBLISHED_PULSE
 
     def __post_init__(self) -> None:
-        # Responses to those that differ by rounding only cannot be told apart.
+        # Frequencies that differ only by rounding are one condition.
         if len(distinct(np.array(self.frequencies_hz))) < len(self.frequencies_hz):
             listed = ", ".join(f"{hz:.10g}" for hz in self.frequencies_hz)
             raise InvalidArgument(f"frequencies_hz: expected each once, got {listed}")

@@ -188,7 +188,7 @@ class Measure(RobotTask):
         policies = load_policies(self.path(folder, POLICIES))
         calibration = Calibration.of_series(self.series(folder), next(iter(policies.values())))
         session = self.path(folder, SESSION)
-        # A killed run cannot be resumed, as its culture is gone with it.
+        # A session that was killed cannot be resumed: the state of its culture is lost.
         shutil.rmtree(session, ignore_errors=True)
         culture = VirtualCulture(self.culture)
         culture.restore_state(self.recordings(folder, self.n_commands) / STATE_FILE)

@@ -140,7 +140,7 @@ def _run_side_by_side(
 
     def report(name: str, done: float, total: float = 1.0, note: str = "") -> None:
         if stopped.is_set():
-            # This ends the study that reports.
+            # Raised in the study that reports, which then ends.
             raise AnimatError("stopped")
         with reporting:
             shares[name] = done / total

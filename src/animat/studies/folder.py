@@ -116,7 +116,7 @@ def _is_claimed(folder: Path, what: str, manifest: dict[str, Any], files: list[s
     """Whether the folder already belongs to this work, whose description is the first of its files, or is free."""
     found = read_description(folder / files[0], what)
     if found is None:
-        # Hidden files are half written by a killed run, locks, or another program's.
+        # Hidden files do not count: they are locks, unfinished files of a killed run, or another program's.
         if folder.is_dir() and not all(path.name.startswith(".") for path in folder.iterdir()):
             raise Mismatch(f"{folder}: expected an empty folder or one of this {what}, got one with other files in it")
         return False

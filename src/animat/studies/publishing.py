@@ -80,7 +80,7 @@ def _lead(study: Study) -> str:
 
 def _colophon(study: Study, manifest: Mapping[str, Any]) -> list[str]:
     versions = ", ".join(f"{name} {version}" for name, version in manifest["versions"].items())
-    # Recordings at hand have no seed.
+    # Recordings from files have no seed.
     is_grown = study.needs_neurons and study.culture.kind == "virtual"
     seeds = f"culture {study.culture.seed}, " if is_grown else ""
     return [

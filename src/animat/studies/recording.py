@@ -81,7 +81,7 @@ class Fit(StudyTask):
     def make(self, folder: Path, progress: Progress) -> list[Path]:
         study, series = self.study, read_series(self.study, folder)
         timeline = fit_simulators(study, series)
-        noticed = [*timeline.findings, *_moved(study, timeline.start_min.tolist())]
+        noticed = [*timeline.findings, *_moved_comparisons(study, timeline.start_min.tolist())]
         presentation = timeline.presentation
         # Recordings in blocks, as the paper's, cannot be simulated with memory.
         if presentation is None or presentation.order != "blocked":
@@ -123,7 +123,7 @@ def _write_responses(path: Path, series: list[Responses]) -> Path:
     return write_table(path, [*head, *(f"rate_hz of {name}" for name in names)], rows)
 
 
-def _moved(study: Study, start_min: list[float]) -> Iterator[Finding]:
+def _moved_comparisons(study: Study, start_min: list[float]) -> Iterator[Finding]:
     """A finding for each comparison at a minute at which no recording starts."""
     for old, new in zip(study.comparisons, study.at_recordings(start_min).comparisons, strict=True):
         if old.at_min is not None and old.at_min != new.at_min:

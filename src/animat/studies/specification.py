@@ -28,7 +28,6 @@ MOST_TRAINED = 20_000
 FINEST_RESOLUTION = 2.0
 """Of the optimal return's grid: the cartpole's tables take 2 GiB there, and grow with its fourth power."""
 
-
 _NO_NAMES = ("na", "null", "none")
 """In small letters, what programs that read tables take for a missing value."""
 
@@ -165,7 +164,7 @@ class Arm:
 
     def __post_init__(self) -> None:
         if not self.through_neurons:
-            # Both have their defaults: arms that differ in nothing else share controls and an optimum.
+            # Neither has an effect without neurons: with defaults, such arms share controls and an optimum.
             object.__setattr__(self, "delivery", "chosen")
             object.__setattr__(self, "percentiles", "moving")
             return
@@ -273,6 +272,27 @@ class Study:
         for name in ("robots", "arms"):
             if not getattr(self, name):
                 raise InvalidArgument(f"{name}: expected at least one, got none")
+        self._expect_fitting_robots()
+        _expect_unique("robots", [spec.name for spec in self.robots])
+        _expect_unique("arms", [arm.slug for arm in self.arms], ": capitals, and spaces for dashes, make no difference")
+        _expect_unique("comparisons", [compared.name for compared in self.comparisons])
+        self._expect_feasible()
+        known = [arm.name for arm in self.arms]
+        for compared in self.comparisons:
+            for side in ("first", "second"):
+                if (name := getattr(compared, side)) not in known:
+                    raise InvalidArgument(
+                        f"comparisons.{side}: expected one of the arms {', '.join(known)}, got {name!r} in "
+                        f"{compared.name!r}"
+                    )
+        if self.culture.kind != "files" and self.needs_neurons:
+            self._expect_a_choice()
+            for compared in self.comparisons:
+                self._minute_of(compared, [i * self.culture.interval_min for i in range(self.culture.sessions)])
+        read_record(SAC, self.algorithm, "algorithm")
+
+    def _expect_fitting_robots(self) -> None:
+        """Raise unless every robot has as many commands as there are readouts, and lessons that suit all arms."""
         n_readouts = count_readouts(readouts_named(self.simulators.readouts))
         for spec in self.robots:
             robot = spec.robot()
@@ -288,10 +308,9 @@ class Study:
                     expect_lessons(spec.lessons, robot, draws_recordings=drawn)
                 except InvalidArgument as error:
                     raise InvalidArgument(f"robots.lessons: {error} ({spec.name}, {arm.name})") from error
-        _expect_unique("robots", [spec.name for spec in self.robots])
-        _expect_unique("arms", [arm.slug for arm in self.arms], ": capitals, and spaces for dashes, make no difference")
-        _expect_unique("comparisons", [compared.name for compared in self.comparisons])
-        # All policies are evaluated side by side.
+
+    def _expect_feasible(self) -> None:
+        """Raise for more episodes than fit side by side, or more policies than a study can have."""
         for name, episodes in (
             ("episodes", self.episodes),
             ("episodes_over_time", self.episodes_over_time),
@@ -306,19 +325,6 @@ class Study:
             raise InvalidArgument(
                 f"policies: expected at most {MOST_TRAINED:,} in a study, got {trained:,} (robots x arms x policies)"
             )
-        known = [arm.name for arm in self.arms]
-        for compared in self.comparisons:
-            for side in ("first", "second"):
-                if (name := getattr(compared, side)) not in known:
-                    raise InvalidArgument(
-                        f"comparisons.{side}: expected one of the arms {', '.join(known)}, got {name!r} in "
-                        f"{compared.name!r}"
-                    )
-        if self.culture.kind != "files" and self.needs_neurons:
-            self._expect_a_choice()
-            for compared in self.comparisons:
-                self._minute_of(compared, [i * self.culture.interval_min for i in range(self.culture.sessions)])
-        read_record(SAC, self.algorithm, "algorithm")
 
     def _expect_a_choice(self) -> None:
         settings, frequencies_hz = self.simulators, self.culture.protocol().frequencies_hz

@@ -143,7 +143,7 @@ class Course:
         minute = self._minute(index)
         timeline = self._timeline
         if timeline and index and timeline.row_at(minute) != timeline.row_at(self._minute(index - 1)):
-            # A culture is easier to control at some minutes than at others: compare on the simulator now in use.
+            # Scores on different simulators cannot be compared: assess the best one again on the simulator now in use.
             score = self._scores(best, simulator)
         new_score = self._scores(deployed, simulator)
         iterations = training.chunk(index)[1] * training.algorithm.environments
@@ -151,7 +151,7 @@ class Course:
         policies = np.arange(len(lesson))
         old_rank = np.column_stack([table[best_at, policies, 2], np.nan_to_num(score)]).tolist()
         new_rank = np.column_stack([lesson + 1, np.nan_to_num(new_score)]).tolist()
-        # Among equals the last, as a policy keeps learning.
+        # Of equal scores the latest counts, as a policy keeps learning.
         is_best = np.array([new >= old for new, old in zip(new_rank, old_rank, strict=True)])
         for kept, new in zip(jax.tree.leaves(best), jax.tree.leaves(deployed), strict=True):
             kept[is_best] = np.asarray(new)[is_best]

@@ -118,7 +118,7 @@ def _describe_simulators(timeline: SimulatorTimeline) -> dict[str, Any]:
     return {
         **timeline.fitted,
         "conditions": [condition.label for condition in timeline.conditions],
-        # Policies contain what conditions deliver, and may pay for it.
+        # Stored in policies, whose reward may contain the cost of these electrodes.
         "electrodes": [condition.electrodes for condition in timeline.conditions],
         "window_ms": timeline.window_ms,
         "presentation": None if timeline.presentation is None else str(timeline.presentation),

@@ -118,7 +118,7 @@ class Policy:
         if self.assessments.ndim != 2 or self.assessments.shape[1] != 5 or self.assessments.dtype.kind != "f":
             raise InvalidArgument(f"assessments: expected rows of five, got shape {self.assessments.shape}")
         expect_provenance(self.provenance)
-        # As in recordings: a policy that was checked stays what it is.
+        # Read-only, so that a checked policy cannot be changed.
         for name in ("weights", "biases"):
             vars(self)[name] = tuple(map(read_only_copy, getattr(self, name)))
         for name in ("scales", "learning_curve", "assessments"):
@@ -127,7 +127,7 @@ class Policy:
             expect_fit(self.robot.name, self.robot.n_commands, len(self.readouts))
 
     def _expect_network(self) -> None:
-        """Refuse weights from which no meaningful action can be computed."""
+        """Refuse weights whose shapes do not fit together, or that are not finite."""
         n_outputs = 2 * self.robot.n_commands if self.n_actions is None else self.n_actions
         n_inputs = len(self.robot.observation_spec) + len(INITIAL_HISTORY) * self.neural_observation
         widths = [n_inputs, *(bias.size for bias in self.biases)]
@@ -197,7 +197,7 @@ class Policy:
         if not trained:
             return None
         if swaps := self.provenance.get("swaps"):
-            # Live training may have been interrupted, and takes newer recordings as they come.
+            # In live training the recordings in use are known only from the swaps, also if it was interrupted.
             return max(first_min, float(swaps[-1]["recorded_at_min"]))
         if not trained.get("shadowing") or trained.get("duration_min") is None:
             return first_min
@@ -209,7 +209,7 @@ class Policy:
         Raises InvalidArgument for one of the wrong shape, or with NaN or infinity, which would pass for an action.
         """
         shape = self.scales.shape
-        # An array's attribute comes first, as reading it takes only a hundredth of a decision's time.
+        # The attribute is read first: `np.shape` takes much longer, at every decision.
         if getattr(observation, "shape", None) != shape and np.shape(observation) != shape:
             got, name = np.shape(observation), self.robot.name
             raise InvalidArgument(f"observation: expected one of {name}, shape {shape}, got shape {got}")
@@ -288,7 +288,7 @@ class Policy:
         robot or mapping is not registered here.
         """
         path = expect_plain_file(path, _MOST_BYTES)
-        arrays, description = _read(path)
+        arrays, description = _read_arrays(path)
         try:
             return Policy(
                 weights=tuple(arrays[f"layer{i}.weight"] for i in range(_LAYERS)),
@@ -325,7 +325,7 @@ def _squash(z: Float64[np.ndarray, " commands"]) -> float | Float64[np.ndarray, 
     return math.tanh(z[0]) if len(z) == 1 else np.tanh(z)
 
 
-def _read(path: Path) -> tuple[dict[str, np.ndarray[Any, Any]], dict[str, Any]]:
+def _read_arrays(path: Path) -> tuple[dict[str, np.ndarray[Any, Any]], dict[str, Any]]:
     """A policy's arrays and its description; a file with other arrays is refused unread."""
     from safetensors import SafetensorError, safe_open
 

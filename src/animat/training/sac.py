@@ -299,9 +299,9 @@ def learn(
 
 
 def _adam(settings: SAC) -> optax.GradientTransformation:
-    # Flattened, as one long vector compiles faster than nineteen arrays and runs as fast.
+    # Flattened: one long vector compiles faster than nineteen arrays, and runs as fast.
     # Before any reward is found, gradients are almost 0. With a smaller epsilon Adam turns their noise into full steps,
-    # which in one navigation policy of twenty permanently switched off every unit of the second layer.
+    # which can switch off all units of a layer for good.
     return optax.flatten(optax.adam(settings.learning_rate, eps=1e-5))
 
 

@@ -30,7 +30,7 @@ FORMER = {
 
 
 def _expect_shadowing(value: Any) -> Any:
-    # Not as a union, whose error would name one of the two types only.
+    # Not as a union type, whose error message would name only one of its members.
     value = bool(value) if isinstance(value, np.bool_) else value
     if not isinstance(value, bool) and value != "drawn":
         raise ValueError(f"expected True, False or 'drawn', got {shown(value)}")

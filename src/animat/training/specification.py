@@ -46,7 +46,7 @@ class _Named(Generic[T]):
 
     def __get__(self, training: object, owner: type) -> T:
         if training is None:
-            # This is how a dataclass finds that the field has no default.
+            # On the class, this error tells the dataclass decorator that the field has no default.
             raise AttributeError(self._name)
         value: T = vars(training)[self._name]
         return value

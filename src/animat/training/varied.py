@@ -82,7 +82,7 @@ class Varied(Wrapper[RobotState]):
         first, last = self.ranges.recordings
         recording = jax.random.randint(recording_key, (), first, last + 1)
         info = state.info | {"parameters": parameters, "recording": recording}
-        return state._replace(robot=_started(environment.robot, state.robot, drawn), info=info)
+        return state._replace(robot=_with_drawn_start(environment.robot, state.robot, drawn), info=info)
 
     def observe(self, state: State) -> Float[Array, " observations"]:
         return self._in(state).observe(state)
@@ -152,7 +152,7 @@ def expect_varied(robot: Robot[Any], varying: Varying) -> None:
             raise InvalidArgument(f"lessons: parameters.{name}: expected {expected}, got {got}") from error
 
 
-def _started(robot: Robot[Any], state: Any, drawn: Mapping[str, Array]) -> Any:
+def _with_drawn_start(robot: Robot[Any], state: Any, drawn: Mapping[str, Array]) -> Any:
     """The initial state with the numbers that were drawn; NaN: unchanged."""
     if not drawn:
         return state

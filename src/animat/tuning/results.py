@@ -76,7 +76,7 @@ class TuningResult:
 def write_results(folder: Path, tuning: Tuning, trials: Sequence[Trial], finals: Sequence[Final]) -> TuningResult:
     """Write the results of a tuning into its folder, reproducibly."""
     importance = importance_of(tuning.space, trials)
-    # Among equals the study's own, or else the one that was found first.
+    # Of equal means the earliest trial's: the study's own settings are the first.
     best = max(finals, key=lambda final: (final.mean, -final.trial))
     tuned = TuningResult(folder, best, tuple(finals), tuple(trials), importance)
     study = with_settings(tuning.study, best.settings)
@@ -117,7 +117,7 @@ def draw_history(tuned: TuningResult, rungs: Sequence[int], title: str) -> Figur
         so_far = list(accumulate((mean for _, mean in whole), max))
         x = [*(number for number, _ in whole), tuned.trials[-1].trial]
         axes.step(x, [*so_far, so_far[-1]], where="post", color=BLUE, linewidth=1.2, label="best fully trained so far")
-    # Diverged ones, however far they were trained before.
+    # Diverged trials are shown even if they were not trained to the end.
     if diverged := [trial.trial for trial in tuned.trials if trial.state == "diverged"]:
         low = axes.get_ylim()[0]
         axes.plot(diverged, [low] * len(diverged), "x", color=RED, label="diverged")

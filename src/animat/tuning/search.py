@@ -97,7 +97,7 @@ class Search:
         """Propose the settings of the next `n` trials, before the result of any of them is known."""
         self._running = [self._study.ask(self._distributions) for _ in range(n)]
         proposed = [_mirrored(self._space, trial.params) for trial in self._running]
-        # As they are written: a discount of 0.1 would come back as 0.09999999999999998.
+        # The study's own settings as they were written: converted there and back, 0.1 would be 0.09999999999999998.
         for trial, settings in zip(self._running, proposed, strict=True):
             if trial.number < len(self._first):
                 settings.update(self._first[trial.number])

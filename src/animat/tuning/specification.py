@@ -110,7 +110,7 @@ def read_space(table: Mapping[str, Any], study: Study) -> Space:
             if name == "discount" and among.get("log") and among["high"] == 1:
                 raise InvalidArgument(f"{where}: expected high below 1 with log = true, got 1")
         elif isinstance(among, list) and len(among) > 1 and all(each not in among[:i] for i, each in enumerate(among)):
-            space[name] = tuple(_whole(each, own[name]) for each in among)
+            space[name] = tuple(_as_in_study(each, own[name]) for each in among)
         else:
             raise InvalidArgument(
                 f"{where}: expected a range {{ low = ..., high = ... }} or a list of two or more different choices, "
@@ -135,11 +135,11 @@ def _expect_possible(study: Study, name: str, among: Range | tuple[Value, ...], 
         with within(where):
             if name == "mapping" and value == "none":
                 raise InvalidArgument("expected mappings, got 'none': tune policies without neurons separately")
-            with_settings(study, {name: _whole(value, own_settings(study)[name])})
+            with_settings(study, {name: _as_in_study(value, own_settings(study)[name])})
 
 
-def _whole(value: Any, own: Any) -> Any:
-    """An integer if the study's own value is one, as TOML may have 64.0 for a count."""
+def _as_in_study(value: Any, own: Any) -> Any:
+    """A number as an integer if the study's own value is one: TOML may have 64.0 for a count."""
     return int(value) if isinstance(value, float) and isinstance(own, int) and value.is_integer() else value
 
 

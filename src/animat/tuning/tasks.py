@@ -67,7 +67,7 @@ def programs(environment: Environment[Any], algorithm: SAC) -> tuple[Callable[..
         return learner._replace(trained=learner.trained._replace(log_alpha=jnp.log(numbers["initial_alpha"])))
 
     def chunk(numbers: Numbers, learner: Learner, simulator: NeuronSimulator | None, first: Array, last: Array) -> Any:
-        # Traced numbers bypass the record's checks.
+        # Bypasses the record's checks, which would fail for traced numbers.
         settings = object.__new__(SAC)
         vars(settings).update({**vars(algorithm), **numbers})
         return train_chunk(environment, settings, learner, simulator, first, last)
@@ -133,7 +133,7 @@ class TrainTrials(StudyTask):
         study, first = with_settings(self.study, self.trials[0].settings), self.chunks[0]
         places = [_learner_file(Path(self.place), trial, first, self.members[0]) for trial in self.trials if first]
         if study.arms[0].through_neurons:
-            places += {timeline_file(each) for each in (study, _judge(self.study, study))}
+            places += {timeline_file(each) for each in (study, _judging_study(self.study, study))}
         return tuple(place.as_posix() for place in places)
 
     def make(self, folder: Path, progress: Progress) -> list[Path]:
@@ -148,7 +148,7 @@ class TrainTrials(StudyTask):
         training = training_of(studies[0], self.study.robots[0], studies[0].arms[0])
         training = replace(training, seed=self.seeds[0], policies=len(self.members))
         timeline = _timeline(folder, studies[0])
-        judging = _timeline(folder, _judge(self.study, studies[0]))
+        judging = _timeline(folder, _judging_study(self.study, studies[0]))
         together = Trials(training, timeline, algorithms, self.members)
 
         numbers = ",".join(str(trial.trial) for trial in self.trials)
@@ -158,15 +158,15 @@ class TrainTrials(StudyTask):
         done = together.resume(*files) if files else 0
         written = time.monotonic()
         for index in range(done, last):
-            together.train(index, _at(timeline, training.minute(index)))
+            together.train(index, _simulator_at(timeline, training.minute(index)))
             progress.update(index + 1 - first, last - first + 1)
             if index + 1 < last and time.monotonic() - written > CHECKPOINT_S:
                 together.save_checkpoint(checkpoint)
                 written = time.monotonic()
 
         environment = training.environment_on(timeline)
-        simulator = _at(judging, training.minute(CHUNKS - 1))
-        # Otherwise the first policies of two groups would meet the same episodes.
+        simulator = _simulator_at(judging, training.minute(CHUNKS - 1))
+        # A different seed for each group: else the first policies of two groups would have the same episodes.
         seed = self.seeds[1] + self.members[0]
         files = []
         for i, trial in enumerate(self.trials):
@@ -194,7 +194,7 @@ def _learner_file(place: Path, trial: Trial, chunks: int, member: int) -> Path:
     return place / f"t{trial.trial}-p{member}-{chunks}.npz"
 
 
-def _judge(own: Study, trial: Study) -> Study:
+def _judging_study(own: Study, trial: Study) -> Study:
     """The study that judges a trial: with simulators of the study's own kind, for the trial's conditions."""
     return replace(trial, simulators=replace(trial.simulators, kind=own.simulators.kind))
 
@@ -205,7 +205,7 @@ def _timeline(folder: Path, study: Study) -> SimulatorTimeline | None:
     return load_timeline(folder / timeline_file(study)).with_percentiles(study.arms[0].percentiles)
 
 
-def _at(timeline: SimulatorTimeline | None, minute: float) -> Any:
+def _simulator_at(timeline: SimulatorTimeline | None, minute: float) -> Any:
     """The simulator in use `minute` minutes after the first recording; None without neurons."""
     return None if timeline is None else timeline.at(float(timeline.start_min[0]) + minute)
 

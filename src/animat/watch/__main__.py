@@ -16,6 +16,6 @@ def _announce(address: str) -> None:
 
 
 if __name__ == "__main__":
-    # Processes with a deadline come first.
+    # Give way to processes with a deadline, such as a closed loop.
     os.nice(10)
     serve(Path(sys.argv[1]), 0, _announce, parent=int(sys.argv[2]))

@@ -42,7 +42,7 @@ def numbers(values: Any) -> list[float | None]:
 def text(value: Any, most: int = 300) -> str:
     """A value as text that a page can show, truncated if it is long."""
     string = value if isinstance(value, str) else json.dumps(value, default=str)
-    # Halves of surrogate pairs cannot be sent.
+    # Unpaired surrogates cannot be encoded as UTF-8.
     string = string[: most + 1].encode("utf-8", "replace").decode("utf-8")
     return string if len(string) <= most else string[: most - 1] + "…"
 

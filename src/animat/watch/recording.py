@@ -46,7 +46,7 @@ class RecordingView(View):
         if not times_s:
             raise InvalidFile(f"{self.folder}: expected recordings, but they are gone")
         newest = max(times_s, key=lambda file: (times_s[file], file.name))
-        recording, inspection, error = self._look(times_s, newest)
+        recording, inspection, error = self._newest_inspection(times_s, newest)
         in_progress = self.folder / UNDER_WAY in times_s
         n_whole = len(times_s) - in_progress
         blocks = [facts("Recordings", _facts(inspection, n_whole, newest))]
@@ -70,8 +70,8 @@ class RecordingView(View):
                 message = f"{recording.duration_s:.0f} s of the one in progress are shown"
         return in_blocks({"state": state, "message": message, **span}, blocks, error)
 
-    def _look(self, times_s: dict[Path, float], newest: Path) -> _Content:
-        """Read the newest if it changed, or one other that has not been inspected yet: each takes a second or two."""
+    def _newest_inspection(self, times_s: dict[Path, float], newest: Path) -> _Content:
+        """The newest, read again if it changed; else one of the others is inspected, as each takes a second or two."""
         self._shares = {file: row for file, row in self._shares.items() if file in times_s}
         if self._key != (newest, times_s[newest]):
             self._key, self._content = (newest, times_s[newest]), _read(newest)

@@ -164,7 +164,7 @@ class SessionView(View):
         episodes, left_s = outline.episodes, None
         done = sum(episode.is_whole for episode in episodes)
         if done and sums.wall_s is not None:
-            # The time before the first move is spent only once.
+            # The settling before the first move is not repeated, so it does not count for the remaining episodes.
             moving_s = sums.wall_s - (outline.moved_at_s or 0.0)
             left_s = moving_s * (len(self._fields.get("turns", ())) - done) / done
         state = self._state()

@@ -42,7 +42,7 @@ class StudyView(View):
         progress = running_jobs(self.folder, done)
         worked, costs = _work(self.folder, done, progress)
         self._speed.see(worked)
-        # A study that has ended leaves nothing unfinished.
+        # A finished study has removed its folder of unfinished work.
         is_done = bool(done) and not (self.folder / UNFINISHED).exists()
         state = state_of(self.folder, is_done=is_done)
         is_running = state["state"] == "running"
@@ -124,7 +124,7 @@ def _results_of(path: Path) -> list[list[Any]]:
         if (arrays := arrays_in(path, names, _MOST_EPISODES_BYTES)) is None:
             raise InvalidFile(f"{path}: expected the episodes of an arm")
         returns, actors, over_time, agents, at_min = arrays
-        # Episodes over time are few per recording, and a comparison's episodes may be on another recording.
+        # Only those at the last minute: episodes over time are few, and a comparison may be on an earlier recording.
         own = ~over_time.astype(bool) & (agents == "policy") & (at_min == at_min.max())
         return [[robot, arm, float(returns[own].mean()), len(np.unique(actors[own])), int(own.sum())]]
     culture, robot = robot, arm

@@ -55,7 +55,7 @@ class Tail:
 
     def _begin(self) -> None:
         self._places = array("Q", [len(MAGIC)])
-        # Of the file, when its records were last found.
+        # The file's size when its records were last searched for.
         self._size = 0
         self.record = lru_cache(_KEPT)(self._record)
 
@@ -110,7 +110,7 @@ class Tail:
                 if (ours.st_ino, ours.st_dev) != (status.st_ino, status.st_dev) or status.st_size < self._places[-1]:
                     self.close()
             if self._file is None:
-                # A pipe of this name would block, and a link may lead anywhere.
+                # Without blocking or following links: it may be a pipe, or a link to any place.
                 self._file = os.open(self.path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW | os.O_CLOEXEC)
                 if os.pread(self._file, len(MAGIC), 0) != MAGIC:
                     self.close()

@@ -50,7 +50,7 @@ class TrainingView(View):
         planned, iterations = min(training["policies"], _MOST_POLICIES), training["iterations"]
         progress = job_progress(self.folder)
         # What a stopped training had done since its last checkpoint is lost.
-        curves, shares = self._learned(planned, {} if is_locked(self.folder) is False else progress)
+        curves, shares = self._curves_so_far(planned, {} if is_locked(self.folder) is False else progress)
         done = sum(shares.values())
         self._speed.see(done * iterations)
         left_s = self._speed.left_s((planned - done) * iterations)
@@ -73,13 +73,13 @@ class TrainingView(View):
         charts = _learning_charts(curves, _swaps(training, minutes), iterations, levels, missing)
         return in_blocks(state, [facts("So far", rows), *charts, _table(curves, shares, progress)])
 
-    def _learned(self, planned: int, progress: JobProgress) -> tuple[Curves, dict[int, float]]:
+    def _curves_so_far(self, planned: int, progress: JobProgress) -> tuple[Curves, dict[int, float]]:
         """The learning curve of each policy by its number, and the share of its training that is done."""
         curves: Curves = {}
         # Checkpoints of groups on cores, and of all policies trained together on a GPU.
         unfinished = self.folder / UNFINISHED
         for path in (*unfinished.glob("from-p*.npz"), *unfinished.glob("at-once-*.npz")):
-            curves |= self._content(path, _curves_of_checkpoint) or {}
+            curves |= self._cached_content(path, _curves_of_checkpoint) or {}
         shares = {i: min(1.0, len(curves.get(i, ())) / _CHUNKS) for i in range(planned)}
         for name, (share, _) in progress.items():
             members = re.fullmatch(r"p(\d{1,6})(?: to p(\d{1,6}))?", name)
@@ -87,11 +87,11 @@ class TrainingView(View):
                 last = min(int(members[2] or members[1]), planned - 1)
                 shares |= {i: max(shares[i], min(share, 1.0)) for i in range(int(members[1]), last + 1)}
         for i in shares:
-            if (rows := self._content(self.folder / f"p{i}.safetensors", _curve_of_policy)) is not None:
+            if (rows := self._cached_content(self.folder / f"p{i}.safetensors", _curve_of_policy)) is not None:
                 curves[i], shares[i] = rows, 1.0
         return {i: curves[i] for i in shares if i in curves}, shares
 
-    def _content(self, path: Path, read: Any) -> Any:
+    def _cached_content(self, path: Path, read: Any) -> Any:
         """The content of a file, read again only if it changed; None if there is none."""
         time_s = changed_s(path)
         if time_s is None:
@@ -104,7 +104,7 @@ class TrainingView(View):
 def _curves_of_checkpoint(path: Path) -> Curves:
     """The learning curves in a checkpoint, by policy number; empty if it cannot be read."""
     arrays = arrays_in(path, ("curve", "members"), _MOST_BYTES)
-    if arrays is None or (curve := _complete(arrays[0], 3)) is None:
+    if arrays is None or (curve := _with_all_columns(arrays[0], 3)) is None:
         return {}
     if arrays[1].dtype.kind not in "iu" or arrays[1].shape != curve.shape[1:2]:
         return {}
@@ -117,12 +117,12 @@ def _curve_of_policy(path: Path) -> Float64[np.ndarray, "chunks columns"] | None
 
     try:
         with safe_open(expect_own(path), framework="numpy") as file:
-            return _complete(file.get_tensor("learning_curve"), 2)
+            return _with_all_columns(file.get_tensor("learning_curve"), 2)
     except (InvalidFile, OSError, SafetensorError, ValueError, TypeError):
         return None
 
 
-def _complete(curve: np.ndarray, dimensions: int) -> Float64[np.ndarray, "*_ columns"] | None:
+def _with_all_columns(curve: np.ndarray, dimensions: int) -> Float64[np.ndarray, "*_ columns"] | None:
     """Learning curves with the columns of `CURVE`; None for anything else."""
     whole = whole_curve(curve)
     is_curve = whole.ndim == dimensions and whole.shape[-1] == len(CURVE) and whole.dtype.kind == "f"
@@ -137,7 +137,7 @@ def _in_use(training: dict[str, Any], minutes: list[float], share: float) -> lis
         return [("recordings", f"{recordings}; each episode draws one")]
     clock_min = minutes[0]
     if training.get("shadowing"):
-        # At the start of the current chunk.
+        # Simulators change only at the start of a chunk.
         clock_min += (training.get("duration_min") or 0.0) * min(int(_CHUNKS * share), _CHUNKS - 1) / _CHUNKS
     used = max((minute for minute in minutes if minute <= clock_min + 1e-9), default=minutes[0])
     return [("recordings", recordings), ("in use", f"that of minute {used:g}")]

@@ -24,7 +24,7 @@ class TuningView(View):
 
     def __init__(self, folder: Path) -> None:
         super().__init__(folder)
-        # Trials end many at a time, and far apart.
+        # Many trials end at the same time, followed by a long pause.
         self._speed = Speed()
 
     def _title(self) -> str:
@@ -80,7 +80,7 @@ def _finals(results: dict[str, Any]) -> dict[str, Any]:
 
     def place(row: dict[str, Any]) -> tuple[bool, float, float]:
         mean = number(row.get("mean_return"))
-        # One that diverged has no mean.
+        # A trial that diverged has no mean, and comes last.
         return mean is None, -(mean or 0.0), number(row.get("trial")) or 0
 
     rows = [

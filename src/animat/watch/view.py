@@ -102,7 +102,7 @@ def chart(
 def curve(name: str, x: Sequence[float], y: Sequence[float], style: Style, colour: str) -> dict[str, Any]:
     """A curve of a chart: its name in the legend (empty: none), and its points, thinned if there are many."""
     step = max(1, math.ceil(len(x) / 2000))
-    # Always with the last.
+    # The last point is always shown.
     shown = sorted({*range(0, len(x), step), max(0, len(x) - 1)}) if len(x) else []
     xs, ys = ([number(float(values[i])) for i in shown] for values in (x, y))
     return {"name": text(name), "x": xs, "y": ys, "style": style, "colour": colour}

@@ -158,7 +158,7 @@ class CL1Culture(Culture):
         """The device's own identifiers, and whether it is a simulator."""
         kind = "the SDK's simulator" if self.recorded_as.is_simulated else "device"
         return {
-            # As in existing recordings, though the module has moved: a series continues only if this text stays.
+            # Must not change, even if a module moves: a series continues only where it is the same.
             "source": f"CL1 ({kind}) by animat.cultures.cl1",
             "ticks_per_s": str(self._ticks_per_s),
             "pattern_seed": "none: they were given" if self._seed is None else str(self._seed),
@@ -203,7 +203,7 @@ class CL1Culture(Culture):
         except BaseException as error:
             outcome = "what had not begun was interrupted"
             try:
-                # The one that is open now: this session may have ended while the delivery hung.
+                # Not the session that delivered, which may have ended while the delivery hung.
                 if (now_open := self._session) is not None:
                     now_open.interrupt()
             except Exception as failed:

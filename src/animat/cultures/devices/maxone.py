@@ -155,7 +155,7 @@ class MaxOneCulture(Culture):
         wiring = once_opened(self._wiring)
         units = ", ".join(f"{electrode}: {unit}" for electrode, unit in wiring.unit_of.items())
         return {
-            # As in existing recordings, though the module has moved: a series continues only if this text stays.
+            # Must not change, even if a module moves: a series continues only where it is the same.
             "source": "MaxOne by animat.cultures.maxone",
             "dac_lsb_mv": str(self._lsb_mv),
             "stimulation_units": units,
@@ -246,7 +246,7 @@ class MaxOneCulture(Culture):
         stream = while_open(self._stream)
         until = stream.frame() + int(np.ceil(duration_s * FRAMES_PER_S))
         stream.wait(until)
-        # What came meanwhile is discarded.
+        # Spikes during the rest are discarded.
         stream.take(until, until)
 
     def _halt(self) -> None:

@@ -84,7 +84,7 @@ class Coupling:
         kick_factor = rng.lognormal(0.0, parameters.kick_sigma, len(network))
         own_latency_ms = parameters.axon_latency_spread_ms * rng.uniform(0, 1, len(network))
         self._parameters = parameters
-        # Not of methods: with caches of its own methods a coupling would stay in memory until it is garbage-collected.
+        # Caches of functions, not of its own methods: such a cycle would stay in memory until it is garbage-collected.
         reach_of_one = cache(partial(_find_reach, seed, parameters, network, kick_factor, own_latency_ms))
         self._reach_of_all = lru_cache(10_000)(partial(_join_reaches, reach_of_one))
 

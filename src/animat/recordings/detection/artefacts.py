@@ -93,7 +93,7 @@ def without_artefacts(
         before_uv = np.median(voltage_uv[:, max(start - round(2 * per_ms), 0) : max(start, 1)], axis=1)
         # A channel that is still saturated since the previous pulse is not at rest.
         rest_uv = np.where(is_held, rest_uv, before_uv)
-        # From the pulse on: a channel that is still at the end of the blank was still before.
+        # From the pulse on, not the end of the blank: `flat` samples are needed to see that a channel is still.
         pulse = max(at, 0)
         saturated_until = _saturated_until(voltage_uv[:, pulse:stop] - rest_uv[:, None], noise_uv, settings, flat)
         until = np.maximum(pulse + saturated_until, end)

@@ -94,7 +94,7 @@ def detect_spikes(
     noise_uv, level_uv, below, above = _noise_and_level_uv(traces, stimulus, settings, workers)
     length = max(round(settings.chunk_s * rate_hz), 1)
 
-    def search(start: int) -> _Found:
+    def search(start: int) -> _PieceResult:
         piece = read_piece(traces, stimulus, start, min(start + length, traces.samples), round(MARGIN_S * rate_hz))
         return _search(piece, noise_uv, level_uv, rate_hz, settings)
 
@@ -114,7 +114,7 @@ def detect_spikes(
     sample, channel = np.concatenate(samples), np.concatenate(channels)
     order = np.lexsort((channel, sample))
     findings = *_lost(lost, traces.samples), *_findings(noise_uv, len(stimulus), saturations, settings)
-    findings += tuple(_inverted(float(below.sum()), float(above.sum())))
+    findings += tuple(_inverted_finding(float(below.sum()), float(above.sum())))
     return DetectedSpikes(traces.start_s + sample[order] / rate_hz, channel[order], noise_uv, findings)
 
 
@@ -170,7 +170,7 @@ def _noise_and_level_uv(
     return np.asarray(np.concatenate([medians_uv, pieces[:, 2:].sum(axis=0)]), dtype=np.float32)
 
 
-class _Found(NamedTuple):
+class _PieceResult(NamedTuple):
     """The spikes of a piece; how many channels each of its stimuli saturates, and for how many ms; lost samples."""
 
     sample: Int64[np.ndarray, " spikes"]
@@ -180,7 +180,7 @@ class _Found(NamedTuple):
     lost: Counts
 
 
-def _search(piece: Piece, noise_uv: Levels, level_uv: Levels, rate_hz: float, settings: Detection) -> _Found:
+def _search(piece: Piece, noise_uv: Levels, level_uv: Levels, rate_hz: float, settings: Detection) -> _PieceResult:
     depth_uv = np.where(is_dead(noise_uv), np.inf, settings.threshold * noise_uv).astype(np.float32)
     apart = max(round(settings.dead_time_ms * 1e-3 * rate_hz), 1)
     first, last = piece.margin, piece.margin + piece.stop - piece.start
@@ -200,7 +200,7 @@ def _search(piece: Piece, noise_uv: Levels, level_uv: Levels, rate_hz: float, se
         # Channels are counted only in the piece that a pulse starts in; the duration is seen in any of them.
         saturation[:, 0] += cleaned.saturated * is_owned
         saturation[:, 1] = np.maximum(saturation[:, 1], cleaned.longest_ms)
-    return _Found(np.concatenate(samples), np.concatenate(channels), piece.first_stimulus, saturation, lost)
+    return _PieceResult(np.concatenate(samples), np.concatenate(channels), piece.first_stimulus, saturation, lost)
 
 
 def median_noise_uv(voltage_uv: Traces, is_blank: Flags | None = None) -> Levels:
@@ -209,7 +209,7 @@ def median_noise_uv(voltage_uv: Traces, is_blank: Flags | None = None) -> Levels
     NaN for a channel of which nearly everything is blanked.
     """
     if is_blank is not None and is_blank.any():
-        # A sample counts if no channel is blanked, if there are enough of these.
+        # Use the samples in which no channel is blanked; if these are too few, each channel's own.
         kept, samples = ~is_blank.any(axis=0), voltage_uv.shape[1]
         if np.count_nonzero(kept) < 0.5 * samples:
             rows = [row[~blank] for row, blank in zip(voltage_uv, is_blank, strict=True)]
@@ -237,7 +237,7 @@ def find_negative_peaks(
     the first. A channel of infinite depth has none.
     """
     inner = voltage_uv[:, first:last]
-    # The neighbourhood is checked for these few samples only.
+    # Only samples beyond the threshold, which are few, are compared with their neighbours.
     row, column = np.nonzero(inner < -depth_uv[:, None])
     column = column + first
     before, after = np.maximum(column - 1, 0), np.minimum(column + 1, voltage_uv.shape[1] - 1)
@@ -283,7 +283,7 @@ def _lost(lost: Counts, samples: int) -> Iterator[Finding]:
         yield Finding("samples-lost", "note" if share < MUCH_LOST else "warning", message, float(n))
 
 
-def _inverted(below: float, above: float) -> Iterator[Finding]:
+def _inverted_finding(below: float, above: float) -> Iterator[Finding]:
     """A finding on traces whose spikes point upwards, by the sums of the cubes of the samples beyond the threshold."""
     if above > ENOUGH_BEYOND and above > TIMES_ABOVE * below:
         message = (

@@ -44,7 +44,7 @@ def read_csv(table: TextTable, stimuli_path: str | os.PathLike[str] | None = Non
         raise InvalidFile(f"{path}: expected a spike file, got the stimuli that belong to one; name the spike file")
     stimuli = stimuli_beside(path) if stimuli_path is None else Path(stimuli_path)
     provenance = {"source": path.name, "format": "CSV"}
-    columns, findings = _columns(table, SPIKE_COLUMNS), table.findings
+    columns, findings = _known_columns(table, SPIKE_COLUMNS), table.findings
     if not table.rows:
         raise InvalidFile(f"{path}: expected one line per spike, got only a header")
     if stimuli is None:
@@ -55,7 +55,7 @@ def read_csv(table: TextTable, stimuli_path: str | os.PathLike[str] | None = Non
         findings = [*findings, Finding("no-stimuli", "refuse", message)]
     else:
         stimulus_table = read_table(stimuli, "stimulus_time_s")
-        columns |= _columns(stimulus_table, STIMULUS_COLUMNS)
+        columns |= _known_columns(stimulus_table, STIMULUS_COLUMNS)
         findings = [*findings, *stimulus_table.findings]
         provenance["stimuli"] = stimuli.name
     return PlainColumns(**columns).to_recording(provenance, tuple(findings))
@@ -63,7 +63,7 @@ def read_csv(table: TextTable, stimuli_path: str | os.PathLike[str] | None = Non
 
 def read_stimuli_csv(path: Path) -> dict[str, Any]:
     """The stimulus columns of `PlainColumns` in a stimulus file; unknown columns are left out."""
-    return _columns(read_table(path, "stimulus_time_s"), STIMULUS_COLUMNS)
+    return _known_columns(read_table(path, "stimulus_time_s"), STIMULUS_COLUMNS)
 
 
 def stimuli_beside(path: Path) -> Path | None:
@@ -80,7 +80,7 @@ def _stem(path: Path) -> str:
     return path.name.removesuffix(".gz").removesuffix(".csv")
 
 
-def _columns(table: TextTable, known: Mapping[str, tuple[str, ...]]) -> dict[str, Any]:
+def _known_columns(table: TextTable, known: Mapping[str, tuple[str, ...]]) -> dict[str, Any]:
     """The known columns of a table under our names."""
     places = {name: place for name, names in known.items() if (place := table.place(names)) is not None}
     for name, names in known.items():
@@ -162,6 +162,6 @@ def _electrodes(table: TextTable, place: int) -> Column:
         except (ValueError, OverflowError) as error:
             expected = "expected whole numbers separated by spaces, of at most 64 bits"
             raise table.wrong(row, f"stimulus_electrodes: {expected}, got {cell[:40]!r}") from error
-    # The file of the stimuli, not that of the spikes.
+    # Errors name the stimulus file, not the spike file that is being read.
     with in_file(table.path):
         return padded(lists)

@@ -133,7 +133,7 @@ def _nwb(file: Hdf5File, part: str | None, base: Recording) -> RawTraces:
     rate_hz, start_s = file.attribute(f"{at}/starting_time", "rate"), float(file.first(f"{at}/starting_time") or 0.0)
     frame = None
     if file.has(f"{at}/timestamps"):
-        rate_hz, start_s, frame = _timed(file, f"{at}/timestamps")
+        rate_hz, start_s, frame = _rate_and_frames(file, f"{at}/timestamps")
     if not is_positive(rate_hz):
         raise InvalidFile(f"{path}: expected timestamps of /{at}, or a rate in Hz at its starting_time, found none")
     labels = None
@@ -149,7 +149,7 @@ def _nwb(file: Hdf5File, part: str | None, base: Recording) -> RawTraces:
     return traces if frame is None else _with_gaps(file, traces, frame)
 
 
-def _timed(file: Hdf5File, at: str) -> tuple[float, float, Int64[np.ndarray, " samples"]]:
+def _rate_and_frames(file: Hdf5File, at: str) -> tuple[float, float, Int64[np.ndarray, " samples"]]:
     """The rate of samples with timestamps, in Hz, the time of the first, and the number of each, gaps included."""
     time_s = file.read(at).astype(np.float64).reshape(-1)
     step_s = np.diff(time_s)
@@ -184,23 +184,7 @@ def _traces(
     samples, columns = dataset.shape[::-1] if channels_first else dataset.shape
     if isinstance(uv_per_step, np.ndarray) and len(uv_per_step) != columns:
         raise InvalidFile(f"{path}: expected a conversion of each of the {columns} traces, got {len(uv_per_step)}")
-    table = base.channels
-    if labels is None and len(table) == columns:
-        rows = np.arange(columns)
-    else:
-        row_of = {str(label): row for row, label in enumerate(table.label)}
-        names = range(columns) if labels is None else labels[:columns]
-        rows = np.array([row_of.get(str(name), UNKNOWN) for name in names], dtype=np.int64)
-    used = np.flatnonzero(rows != UNKNOWN)
-    if len(used):
-        # If a channel occurs twice in the traces, its first column is used.
-        _, first = np.unique(rows[used], return_index=True)
-        used = used[np.sort(first)]
-        kept = rows[used]
-        channels = Channels(table.label[kept], table.electrode[kept], table.x_um[kept], table.y_um[kept])
-    else:
-        used, nowhere = np.arange(columns), np.full(columns, np.nan)
-        channels = Channels(used.astype(np.str_), np.full(columns, UNKNOWN), nowhere, nowhere)
+    used, channels = _channels_in(base.channels, columns, labels)
     scale = uv_per_step[used] if isinstance(uv_per_step, np.ndarray) else uv_per_step
 
     def read_uv(start: int, stop: int) -> Float32[np.ndarray, "samples channels"]:
@@ -214,6 +198,28 @@ def _traces(
         return in_microvolts(piece, scale)
 
     return RawTraces(read_uv, channels, int(samples), base.sampling_rate_hz, start_s)
+
+
+def _channels_in(table: Channels, columns: int, labels: Any) -> tuple[Int64[np.ndarray, " used"], Channels]:
+    """The columns of traces that belong to channels of a table, and these channels; all columns if none do.
+
+    Columns without labels are the table's channels in their order, or are numbered.
+    """
+    if labels is None and len(table) == columns:
+        rows = np.arange(columns)
+    else:
+        row_of = {str(label): row for row, label in enumerate(table.label)}
+        names = range(columns) if labels is None else labels[:columns]
+        rows = np.array([row_of.get(str(name), UNKNOWN) for name in names], dtype=np.int64)
+    used = np.flatnonzero(rows != UNKNOWN)
+    if not len(used):
+        every, nowhere = np.arange(columns), np.full(columns, np.nan)
+        return every, Channels(every.astype(np.str_), np.full(columns, UNKNOWN), nowhere, nowhere)
+    # If a channel occurs twice in the traces, its first column is used.
+    _, first = np.unique(rows[used], return_index=True)
+    used = used[np.sort(first)]
+    kept = rows[used]
+    return used, Channels(table.label[kept], table.electrode[kept], table.x_um[kept], table.y_um[kept])
 
 
 def _number(value: Any, otherwise: float) -> float:

@@ -179,7 +179,7 @@ def _events(file: Hdf5File, layout: _Layout, stimuli: str | None) -> tuple[Colum
     columns = stimulus_columns(texts)
     if "eventid" in names and "stimulus_pattern" not in columns:
         identity = file.read(at, "eventid")[is_stimulus].astype(np.int64)
-        # Numbers of which none comes twice count the events.
+        # If no number occurs twice, they only count the events, and are no patterns.
         if 1 < len(np.unique(identity)) < len(identity) and np.all(identity >= 0):
             columns["stimulus_pattern"] = identity
             layout.provenance["stimulus_pattern"] = "the events' eventid"

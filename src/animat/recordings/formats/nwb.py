@@ -68,9 +68,12 @@ def write_nwb(
         expected = f"times within the recording ({recording.start_s:g} to {recording.stop_s:g} s)"
         raise UnusableData(f"spike_times_s: expected {expected}, got {first_s:g} to {last_s:g} s")
     tree = nwb_file(recording, of_channels)
-    with atomic_write(path) as temporary, _Disk(temporary, "r+") as disk:
+    with atomic_write(path) as temporary, _ErrorKeepingFile(temporary, "r+") as disk:
         try:
-            with h5py.File(disk, "w") as file, NWBHDF5IO(file=file, mode="w", manager=BuildManager(_types())) as nwb_io:
+            with (
+                h5py.File(disk, "w") as file,
+                NWBHDF5IO(file=file, mode="w", manager=BuildManager(_types())) as nwb_io,
+            ):
                 nwb_io.write(tree)
                 if len(recording.channels):
                     write_spikes(file[f"{UNITS}/spike_times"], spikes, of_channels)
@@ -94,7 +97,7 @@ def recording_name(start_min: float) -> str:
     return f"recording_{format(start_min, 'g').zfill(4)}_min.nwb"
 
 
-class _Disk(io.FileIO):
+class _ErrorKeepingFile(io.FileIO):
     """A file that accepts every write and remembers the first error, as HDF5 does not recover from a full disk."""
 
     error: OSError | None = None

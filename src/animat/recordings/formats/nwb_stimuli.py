@@ -40,11 +40,11 @@ def read_stimuli(file: Hdf5File, asked: str | None, findings: list[Finding]) -> 
 
     The user may ask for stimuli by a path, or its last part, and must if there are several candidates.
     """
-    at = _place(file, asked, findings)
+    at = _find_stimuli(file, asked, findings)
     if at is None:
         return {"stimulus_time_s": np.empty(0)}
     times = _times_column(file, at)
-    columns = {"stimulus_time_s": _of_series(file, at)} if times is None else _of_table(file, at, times, findings)
+    columns = {"stimulus_time_s": _from_series(file, at)} if times is None else _from_table(file, at, times, findings)
     n_rows, source = len(columns["stimulus_time_s"]), at
     if times not in (None, "start_time"):
         has_one = np.isfinite(columns["stimulus_time_s"])
@@ -55,7 +55,7 @@ def read_stimuli(file: Hdf5File, asked: str | None, findings: list[Finding]) -> 
     return columns
 
 
-def _place(file: Hdf5File, asked: str | None, findings: list[Finding]) -> str | None:
+def _find_stimuli(file: Hdf5File, asked: str | None, findings: list[Finding]) -> str | None:
     """Where the stimuli are: where asked, in /stimulus/presentation, or elsewhere under a name that mentions them."""
     first = [f"{FIRST}/{name}" for name in file.names(FIRST)]
     elsewhere = [f"{room}/{name}" for room in ELSEWHERE for name in file.names(room)]
@@ -102,12 +102,12 @@ def _onset_column(file: Hdf5File, at: str) -> str | None:
     if not len(onset_s) == len(start_s) == len(stop_s):
         return None
     known = np.isfinite(onset_s)
-    # Times since the beginning of the trial, or in ms, lie elsewhere.
+    # Times that count from the trial's start, or are in ms, do not lie within their intervals.
     lies_within = (start_s <= onset_s) & (onset_s <= stop_s)
     return named[0] if np.any(known) and np.all(lies_within[known]) else None
 
 
-def _of_table(file: Hdf5File, at: str, times: str, findings: list[Finding]) -> dict[str, Any]:
+def _from_table(file: Hdf5File, at: str, times: str, findings: list[Finding]) -> dict[str, Any]:
     """The columns of a table of intervals or events, with the times of the stimuli in the column `times`."""
     time_s = file.read(f"{at}/{times}").reshape(-1)
     columns: dict[str, Any] = {"stimulus_time_s": time_s}
@@ -196,7 +196,7 @@ def _electrodes_in_rows(file: Hdf5File, at: str, rows: Column) -> Column | None:
     return numbers[rows]
 
 
-def _of_series(file: Hdf5File, at: str) -> Column:
+def _from_series(file: Hdf5File, at: str) -> Column:
     """The time of each pulse of a series: each entry that is not 0 (all if all are 0), or each onset if sampled."""
     if file.has(f"{at}/timestamps"):
         time_s = file.read(f"{at}/timestamps").reshape(-1)

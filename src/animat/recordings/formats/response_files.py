@@ -32,7 +32,7 @@ def _is_response_table(table: TextTable) -> bool:
     if names & SPIKE_COLUMNS.keys() or file_name.endswith(("_spikes.csv", "_spikes.csv.gz")):
         return False
     if file_name.endswith(("_responses.csv", "_responses.csv.gz")) and not names & {"time", "time_s"}:
-        # It is meant to be one, whatever it lacks.
+        # By its name it is a response table, even if columns are missing.
         return True
     is_long = "channel" in names and bool(names & set(KINDS))
     return is_long or any(name.startswith(f"{kind}_") for name in names for kind in KINDS)
@@ -66,7 +66,7 @@ def read_response_npz(path: Path) -> ResponseTable | None:
     window_ms = None if window is None else (float(window[0]), float(window[1]))
     columns = {"channel_label": np.arange(n_channels), **arrays}
     provenance = {"source": path.name, "format": "NPZ of responses"}
-    return _table(values, NPZ_KEYS[key], columns, window_ms, provenance, left_out_findings("keys", left_out))
+    return _to_table(values, NPZ_KEYS[key], columns, window_ms, provenance, left_out_findings("keys", left_out))
 
 
 def read_response_table(table: TextTable) -> ResponseTable | None:
@@ -74,7 +74,7 @@ def read_response_table(table: TextTable) -> ResponseTable | None:
     if not _is_response_table(table):
         return None
     is_long = table.place(("channel",)) is not None
-    values, kind, labels, first_of = _long(table) if is_long else _wide(table)
+    values, kind, labels, first_of = _read_long(table) if is_long else _read_wide(table)
     columns: dict[str, Any] = {"channel_label": labels}
     for name, names in TABLE_COLUMNS.items():
         if (place := table.place(names)) is not None:
@@ -87,10 +87,10 @@ def read_response_table(table: TextTable) -> ResponseTable | None:
     table.note_left_out([alias for name, names in TABLE_COLUMNS.items() if name not in columns for alias in names])
     window_ms = None if start_ms is None or end_ms is None else (start_ms, end_ms)
     provenance = {"source": table.path.name, "format": "CSV of responses"}
-    return _table(values, kind, columns, window_ms, provenance, tuple(table.findings))
+    return _to_table(values, kind, columns, window_ms, provenance, tuple(table.findings))
 
 
-def _wide(table: TextTable) -> _Read:
+def _read_wide(table: TextTable) -> _Read:
     """Read a table with one line per stimulus."""
     places = {kind: [i for i, h in enumerate(table.header) if folded(h).startswith(f"{kind}_")] for kind in KINDS}
     kinds = [kind for kind in KINDS if places[kind]]
@@ -101,7 +101,7 @@ def _wide(table: TextTable) -> _Read:
     labels = np.array([_label(table.header[i], kind) for i in places[kind]], dtype=np.str_)
     values = np.column_stack([table.numbers(i, table.header[i], required=True) for i in places[kind]])
     table.used.update(places[kind])
-    # It is known, though nothing needs it.
+    # Mark the trial column as used, so that it is not reported as unknown.
     table.place((TRIAL,))
     return values, kind, labels, np.arange(len(table.rows))
 
@@ -111,7 +111,7 @@ def _label(head: str, kind: ResponseKind) -> str:
     return next(head[i:].strip() for i in range(len(head) + 1) if folded(f"{head[:i]}x") == f"{kind}_x")
 
 
-def _long(table: TextTable) -> _Read:
+def _read_long(table: TextTable) -> _Read:
     """Read a table with one line per stimulus and channel."""
     places = {kind: place for kind in KINDS if (place := table.place((kind,))) is not None}
     trial, channel = table.place((TRIAL, *TABLE_COLUMNS["stimulus_time_s"])), table.place(("channel",))
@@ -166,7 +166,7 @@ def _constant(table: TextTable, name: str) -> float | None:
     return float(values[0])
 
 
-def _table(
+def _to_table(
     values: Column,
     kind: ResponseKind,
     columns: dict[str, Any],

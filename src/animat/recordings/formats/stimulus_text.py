@@ -77,7 +77,7 @@ def stimulus_columns(lines: Sequence[str]) -> dict[str, Any]:
     counts = {_whole(pulse.get("pulses")) for pulse in pulses}
     n_pulses = next(iter(counts)) if len(counts) == 1 else UNKNOWN
     presentation = np.array([_whole(pulse.get("presentation")) for pulse in pulses], dtype=np.int64)
-    # Pulses that belong to no particular trial all have the same number, and do not say how many a trial has.
+    # If trials are not known, all pulses have the same number and state no pulses per trial.
     is_numbered = len(np.unique(presentation)) > 1 or n_pulses > 1
     has_presentation = is_numbered and bool(np.all(presentation != UNKNOWN))
     if has_presentation:

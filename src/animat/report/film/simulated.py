@@ -10,12 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from animat.closed_loop.runner import runner_of
-from animat.environment import Animat, Environment, WithoutNeurons
+from animat.environment import Animat, Environment, Neurons, WithoutNeurons
 from animat.errors import InvalidArgument
 from animat.evaluation.rollouts import check_seed
 from animat.neurons.timeline import SimulatorTimeline
 from animat.report.film.scene import Moment, Scene
 from animat.report.film.session import USUAL_S
+from animat.responses.condition import Condition
+from animat.stimulation.protocol import Presentation
 from animat.training.policy import Policy, first_of_alike
 from animat.wrappers import ShuffledDelivery
 
@@ -47,15 +49,8 @@ def scene_of_policies(
     check_seed(seed)
     first = first_of_alike(policies, _ALIKE, "film it alone")
     from_s, to_s = span_s or (0.0, USUAL_S)
-    robot, simulator = first.robot, None
-    environment: Environment[Any] = WithoutNeurons(robot, first.commands)
-    if first.mapping is not None and timeline is not None:
-        if timeline.conditions != first.conditions:
-            raise InvalidArgument("recordings: expected the conditions that the policies choose from, got others")
-        row = timeline.requested_row(timeline.start_min[-1] if at_min is None else at_min)
-        simulator = timeline.with_percentiles(first.percentiles).at(float(timeline.start_min[row]))
-        environment = Animat(robot, first.mapping, len(first.conditions))
-        environment = ShuffledDelivery(environment) if first.delivery == "shuffled" else environment
+    robot = first.robot
+    environment, simulator = _environment(first, timeline, at_min)
     respond = jax.jit(environment.respond)
     state = environment.reset(jax.random.key(seed))
     rng, runner_seed = np.random.default_rng([seed, 1]), (seed, 22)
@@ -77,8 +72,7 @@ def scene_of_policies(
             label, period_s = "", _WITHOUT_NEURONS_S
             if simulator is not None:
                 condition = first.conditions[int(delivered)]
-                pulses = 1 if first.presentation is None else first.presentation.pulses
-                label, period_s = condition.label, pulses / (condition.frequencies_hz or (1 / _WITHOUT_NEURONS_S,))[0]
+                label, period_s = condition.label, _period_s(condition, first.presentation)
             time_s += period_s
             at, rate_hz = tuple(observation.tolist()), float(np.mean(response.rate_hz))
             commands = tuple(u.tolist()) if u.ndim else float(u)
@@ -93,3 +87,23 @@ def scene_of_policies(
     through = "on the simulator" if simulator is not None else "without neurons"
     kept = tuple(each for each in moments if each.episode >= shown)
     return Scene(f"{robot.name} {through}", robot, labels, kept, from_s, min(time_s, to_s), runner_seed=runner_seed)
+
+
+def _environment(
+    policy: Policy, timeline: SimulatorTimeline | None, at_min: float | None
+) -> tuple[Environment[Any], Neurons]:
+    """What a policy acts in: through the simulator of the newest recording at a minute, or without neurons."""
+    if policy.mapping is None or timeline is None:
+        return WithoutNeurons(policy.robot, policy.commands), None
+    if timeline.conditions != policy.conditions:
+        raise InvalidArgument("recordings: expected the conditions that the policies choose from, got others")
+    row = timeline.requested_row(timeline.start_min[-1] if at_min is None else at_min)
+    simulator = timeline.with_percentiles(policy.percentiles).at(float(timeline.start_min[row]))
+    environment: Environment[Any] = Animat(policy.robot, policy.mapping, len(policy.conditions))
+    return ShuffledDelivery(environment) if policy.delivery == "shuffled" else environment, simulator
+
+
+def _period_s(condition: Condition, presentation: Presentation | None) -> float:
+    """How long a trial of a condition takes; that of an iteration without neurons if its frequency is not known."""
+    pulses = 1 if presentation is None else presentation.pulses
+    return pulses / (condition.frequencies_hz or (1 / _WITHOUT_NEURONS_S,))[0]

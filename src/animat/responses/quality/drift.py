@@ -48,13 +48,13 @@ def drift_findings(responses: Responses) -> Iterator[Finding]:
     if len(t) < FEWEST or spread <= 0:
         return
     slope = float(t @ x) / spread
-    # The mean of each condition is estimated too (`times` has one more entry than there are of these).
+    # Less one for the slope and one for the mean of each condition: `times` has one more entry than conditions.
     freedom = len(t) - len(times)
     error = math.sqrt(float(np.sum((x - slope * t) ** 2)) / freedom / spread)
     if abs(slope) <= CERTAIN * error:
         return
     span = "in the order of the rows" if responses.time_s is None else f"recording: {np.ptp(time_s) / 60:.1f} min"
-    # A line through responses, which are not below 0, changes by no more; they stop, say, instead.
+    # A straight line cannot fall by more, as responses are not below 0: the change was sudden, for example.
     by = f"{100 * abs(slope):.0f} % of their mean (+- {100 * error:.0f} %)"
     by = by if abs(slope) <= _MOST else f"more than {100 * _MOST:.0f} % of their mean"
     message = (

@@ -125,18 +125,7 @@ def _timing(
         )
         yield Finding("dead-window", "refuse", message)
         return
-    read = stimuli.is_last_of_presentation
-    # Up to the next row that is a pulse, as nothing is delivered at a rest.
-    pulses = np.flatnonzero(~stimuli.is_rest)
-    following = np.searchsorted(pulses, np.arange(len(stimuli)), side="right")
-    gap_ms = 1e3 * (np.append(stimuli.time_s[pulses], np.inf)[following] - stimuli.time_s)
-    # 1e-6 ms: an interval equal to the window's end is not shorter for being rounded.
-    if overlapping := int(np.count_nonzero(read & (gap_ms < end_ms - 1e-6))):
-        message = (
-            f"{overlapping} of {np.count_nonzero(read)} stimuli are followed by another pulse before their window ends "
-            f"at {end_ms:g} ms, so its artefact and response are counted in theirs: use a shorter window"
-        )
-        yield Finding("stimuli-too-close", "warning", message, float(overlapping))
+    yield from _overlapping(stimuli, end_ms)
     rate_hz, _ = spontaneous_rate(recording, after_ms=end_ms)
     n_stimuli, n_all, spikes = _spikes_in_window(responses, recording)
     if math.isnan(rate_hz) and n_all:
@@ -161,13 +150,35 @@ def _timing(
         yield Finding("dead-window", "refuse", message, spikes / expected if expected else 0.0)
         return
     yield from _dead_conditions(responses, recording, assignment, per_stimulus)
-    if response and (response.start_ms >= end_ms or response.end_ms <= start_ms):
+    if response is not None:
+        yield from _place_of(response, start_ms, end_ms)
+
+
+def _overlapping(stimuli: Stimuli, end_ms: float) -> Iterator[Finding]:
+    """A finding on stimuli that are followed by a pulse before their window ends."""
+    read = stimuli.is_last_of_presentation
+    # Up to the next row that is a pulse, as nothing is delivered at a rest.
+    pulses = np.flatnonzero(~stimuli.is_rest)
+    following = np.searchsorted(pulses, np.arange(len(stimuli)), side="right")
+    gap_ms = 1e3 * (np.append(stimuli.time_s[pulses], np.inf)[following] - stimuli.time_s)
+    # 1e-6 ms: an interval equal to the window's end is not shorter for being rounded.
+    if overlapping := int(np.count_nonzero(read & (gap_ms < end_ms - 1e-6))):
         message = (
-            f"the response is at {response} after a stimulus, outside the {window}: use --window-ms "
-            f"{response.start_ms:g} {response.end_ms:g}"
+            f"{overlapping} of {np.count_nonzero(read)} stimuli are followed by another pulse before their window ends "
+            f"at {end_ms:g} ms, so its artefact and response are counted in theirs: use a shorter window"
+        )
+        yield Finding("stimuli-too-close", "warning", message, float(overlapping))
+
+
+def _place_of(response: ResponseTime, start_ms: float, end_ms: float) -> Iterator[Finding]:
+    """A finding on when the response comes, within the window or outside."""
+    if response.start_ms >= end_ms or response.end_ms <= start_ms:
+        message = (
+            f"the response is at {response} after a stimulus, outside the window from {start_ms:g} to {end_ms:g} ms: "
+            f"use --window-ms {response.start_ms:g} {response.end_ms:g}"
         )
         yield Finding("response-elsewhere", "warning", message, response.start_ms)
-    elif response:
+    else:
         message = (
             f"the culture fires above its spontaneous rate from {response} after a stimulus; the window is "
             f"{start_ms:g} to {end_ms:g} ms"

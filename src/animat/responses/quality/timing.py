@@ -109,7 +109,7 @@ def _artefact(
         height, after = count[largest], count[largest : last + 1]
         top, low = int(np.argmax(after)), np.flatnonzero(after < height / 3)
         if after[top] >= TIMES_RESPONSE * height and after[: top + 1].min() >= height / 2:
-            # Artefacts are largest at first; this is how a response begins.
+            # A response, not an artefact: artefacts are largest at first.
             continue
         rises_again = len(low) > 0 and after[low[0] :].max() >= height / 2
         of_each = np.diff(np.searchsorted(spike_times_s, stimulus_s[:, None] + 1e-3 * edges_ms[largest : largest + 2]))
