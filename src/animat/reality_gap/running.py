@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, Self, TypeVar
 
 import numpy as np
@@ -24,7 +25,7 @@ from animat.cultures.budget import Account
 from animat.cultures.failures import describe_error
 from animat.cultures.same_culture import differences
 from animat.environment import Animat, Environment
-from animat.errors import InvalidArgument, InvalidFile, UnusableData, expect_at_least
+from animat.errors import InvalidArgument, InvalidFile, UnusableData, did_you_mean, expect_at_least
 from animat.evaluation import transfer
 from animat.evaluation.controllers import Controller
 from animat.evaluation.controls import RANDOM, Control, controls_of, coupling_of, interventions_of
@@ -107,12 +108,18 @@ def run_policies(
         settings: other attributes of `Loop`; by default pulse and patterns are those of the calibrating recording.
 
     Raises:
-        InvalidArgument: for no policies, or a folder with a session in it.
+        InvalidArgument: for no policies, a folder with a session in it, or a setting that a `Loop` does not have.
         Mismatch: if they differ from each other, or from the calibration's conditions.
         UnusableData: for policies without neurons.
     """
     representative = check_policies(policies)
     expect_at_least("seed", seed, 0)
+    known = {field.name for field in fields(Loop)}
+    for name in settings.keys() - known:
+        meant = did_you_mean(name, {*known, *inspect.signature(run_policies).parameters})
+        raise InvalidArgument(
+            f"{name}: expected an argument of run_policies or an attribute of Loop, got neither{meant}"
+        )
     # Before minutes of prediction.
     expect_no_session(folder)
     transfer.expect_conditions(representative, calibration.conditions, calibration.readouts)
