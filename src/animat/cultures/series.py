@@ -53,7 +53,7 @@ def record_series(
     protocol: Protocol | Callable[[Culture], Protocol],
     folder: str | os.PathLike[str],
     *,
-    sessions: int = 15,
+    sessions: int = 2,
     interval_min: float = 10.0,
     seed: int | None = None,
     progress: Progress | None = None,
@@ -74,7 +74,7 @@ def record_series(
         protocol: of every recording, or a function that returns it for the culture, which is not yet open; the order of
             stimuli differs from recording to recording.
         folder: where the files go; created if it is missing.
-        sessions: number of recordings.
+        sessions: number of recordings; by default as many as a closed loop needs.
         interval_min: minutes between the starts of two recordings.
         seed: of the orders of stimuli; zero or more. None: a virtual culture's own, 1 for any other.
         progress: updated after each block.
