@@ -31,14 +31,13 @@ BODIES = (
     "gymnasium:Pendulum-v1",
     "gymnasium:Reacher-v5",
     "gymnasium:Swimmer-v5",
-    "gymnasium:bodies_of_others:Slider-v0",
 )
 
 
 def main() -> None:
     """Record, train, run, and print the table."""
     parser = argparse.ArgumentParser(description="Bodies on a culture: predicted and measured returns.")
-    parser.add_argument("--bodies", nargs="+", default=list(BODIES), help="the last one is in the tests' folder")
+    parser.add_argument("--bodies", nargs="+", default=list(BODIES))
     parser.add_argument("--seed", type=int, default=1, help="of the virtual culture")
     parser.add_argument("--policies", type=int, default=10)
     parser.add_argument("--episodes", type=int, default=3, help="of each policy, in closed loop")

@@ -226,7 +226,8 @@ def _expect_success(future: Future[TaskResult], job: Job) -> None:
         error.args = (f"{job.name}: {error}",)
         raise
     except CancelledError as error:
-        raise AnimatError(f"{job.name}: its executor has ended; start it, then run this again to continue") from error
+        ended = "its executor (of a cluster: the scheduler) has ended; start it, then run this again to continue"
+        raise AnimatError(f"{job.name}: {ended}") from error
     except Exception as error:
         # Raised by the executor: a process ended, or a machine was lost.
         message = " ".join(str(error).split()) or type(error).__name__

@@ -121,7 +121,7 @@ def read_space(table: Mapping[str, Any], study: Study) -> Space:
         if own[name] not in space[name]:
             raise InvalidArgument(
                 f"{where}: expected it to include the study's own setting, {own[name]!r}, which is tried first; got "
-                f"{shown(among)}"
+                f"{shown(among)}: add it, or change {name} in the study"
             )
     for chosen in itertools.product(*(choices_of(name, space, study) for name in FITTING)):
         with within("tune.search"):
