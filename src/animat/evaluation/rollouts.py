@@ -219,7 +219,7 @@ def roll_out(
         )
     of_episodes = None if starts is None else starts.of_episodes(episodes)
     if isinstance(actors, Called):
-        ran = _call_out(environment, episodes, simulator, actors, keys[0], of_episodes)
+        ran = _roll_out_called(environment, episodes, simulator, actors, keys[0], of_episodes)
     else:
         ran = _roll_out(environment, episodes, simulator, actors, keys, of_episodes)
     *counted, terminated, outcome = jax.device_get(ran)
@@ -313,7 +313,7 @@ def _roll_out(
     return _results(environment, last)
 
 
-def _call_out(
+def _roll_out_called(
     environment: Environment[Any],
     episodes: int,
     simulator: Neurons,

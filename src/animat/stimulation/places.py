@@ -19,7 +19,7 @@ CUT = {"halves": (2, 1), "quadrants": (2, 2)}
 """Columns and rows into which electrodes are divided, as evenly as possible."""
 NAMED = (*CUT, "corners")
 SITES = 8
-"""Electrodes of a corner: with five the commands are less distinct, and more than necessary tire a culture."""
+"""Electrodes of a corner: with fewer the commands are less distinct, and more than necessary tire a culture."""
 _MOST_BYTES = 2**20
 _MOST_PLACES = 1000
 
