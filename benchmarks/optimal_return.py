@@ -1,4 +1,4 @@
-"""The tables of docs/evidence/optimal-return.md: the optimum on synthetic responses, its grids, and its interval.
+"""The optimal return on synthetic responses, on finer and coarser grids, and how often its interval contains it.
 
     python benchmarks/optimal_return.py mappings grids
     python benchmarks/optimal_return.py coverage [--series 60]

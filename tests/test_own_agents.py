@@ -259,9 +259,10 @@ def test_an_agent_runs_beside_policies_with_its_own_prediction(tmp_path: Path, m
         pytest.raises(InvalidArgument, match=r"agents: expected names other than .*, got p0"),
     ):
         run_policies(policies, culture, Calibration.of_series(series), tmp_path / "b", agents={"p0": Wrong(0)})
-    meant = r"controls: expected an argument of run_policies or .*, got neither; did you mean with_controls\?"
-    with FakeCulture() as culture, pytest.raises(InvalidArgument, match=meant):
-        run_policies(policies, culture, Calibration.of_series(series), tmp_path / "b", controls="random")
+    for name, meant in {"controls": r"; did you mean with_controls\?", "robot": "", "adaptive": ""}.items():
+        message = f"{name}: expected an argument of run_policies, or .*, got neither{meant}$"
+        with FakeCulture() as culture, pytest.raises(InvalidArgument, match=message):
+            run_policies(policies, culture, Calibration.of_series(series), tmp_path / "b", **{name: "random"})
 
 
 @pytest.mark.oracle

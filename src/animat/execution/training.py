@@ -112,7 +112,8 @@ def train(
 def _run(tasks: Sequence[TrainGroup], folder: Path, fingerprint: str, progress: Progress, **how: Any) -> None:
     """Run the tasks as jobs, with options of `Jobs.run`.
 
-    If the robot returned numbers that are not finite, nothing is left: after its correction, training must start again.
+    If the robot returned numbers that are not finite, unfinished policies are removed: after its correction, they must
+    start again.
     """
     left = [Job(as_range(task.group.members), task, cost_s=CHUNKS * len(task.group.members)) for task in tasks]
     jobs = Jobs(left, folder, folder / UNFINISHED / "jobs", fingerprint)

@@ -58,6 +58,9 @@ FEWEST_OF_A_CONTROL = 5
 _RESOLUTION = 0.5
 """Of the optimum's grid: fast and coarse, with an error of 0.8 on the range of 200 of the cartpole."""
 
+_DECIDED = {"robot", "mapping", "percentiles", "conditions", "adaptive_from", "remembering"}
+"""Attributes of the loop that policies and calibration decide."""
+
 
 @checked_arguments
 def run_policies(
@@ -108,18 +111,13 @@ def run_policies(
         settings: other attributes of `Loop`; by default pulse and patterns are those of the calibrating recording.
 
     Raises:
-        InvalidArgument: for no policies, a folder with a session in it, or a setting that a `Loop` does not have.
+        InvalidArgument: for no policies, a folder with a session in it, or one of the `settings` that is none.
         Mismatch: if they differ from each other, or from the calibration's conditions.
         UnusableData: for policies without neurons.
     """
     representative = check_policies(policies)
     expect_at_least("seed", seed, 0)
-    known = {field.name for field in fields(Loop)}
-    for name in settings.keys() - known:
-        meant = did_you_mean(name, {*known, *inspect.signature(run_policies).parameters})
-        raise InvalidArgument(
-            f"{name}: expected an argument of run_policies or an attribute of Loop, got neither{meant}"
-        )
+    _expect_open(settings)
     # Before minutes of prediction.
     expect_no_session(folder)
     transfer.expect_conditions(representative, calibration.conditions, calibration.readouts)
@@ -202,6 +200,15 @@ def run_policies(
         whose_work=() if ideal is None else intervention_table(rows, *ideal),
     )
     return _written(gap)
+
+
+def _expect_open(settings: Mapping[str, Any]) -> None:
+    """Refuse a setting of the loop that there is not, or that policies and calibration decide."""
+    names = {field.name for field in fields(Loop)} - _DECIDED
+    for name in sorted(settings.keys() - names):
+        arguments = inspect.signature(run_policies).parameters.keys() - {"settings"}
+        expected = "an argument of run_policies, or an attribute of Loop that policies and calibration leave open"
+        raise InvalidArgument(f"{name}: expected {expected}, got neither{did_you_mean(name, names | arguments)}")
 
 
 def _loop_of(
