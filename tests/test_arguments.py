@@ -99,6 +99,17 @@ def test_lists_and_dictionaries_are_checked_inside_and_unions_said_in_full(tmp_p
             [],
             allow="few-responses",  # type: ignore[arg-type]
         ),
+        "progress: expected a progress, such as animat.Bar('training'), or None, got True": lambda: animat.train(
+            animat.Training("cartpole", "9-thresholds"),
+            timeline,
+            tmp_path / "none",
+            progress=True,  # type: ignore[arg-type]
+        ),
+        "agents: expected agents by name, such as {'mine': Rule()}, or None, got [1]": lambda: animat.evaluate(
+            {},
+            timeline,
+            agents=[1],  # type: ignore[arg-type]
+        ),
         "first: expected numbers, got 'a'": lambda: animat.compare("a", [1.0]),
         "count: expected 1 or 9 thresholds, got 9.0": lambda: animat.Thresholds(9.0),  # type: ignore[arg-type]
     }

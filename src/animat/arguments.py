@@ -27,6 +27,7 @@ _ONE = {
     "NeuronSimulator": "a simulator, as animat.fit_memory returns",
     "PathLike": "a path",
     "Policy": "a policy, of those that animat.load_policies returns",
+    "Progress": "a progress, such as animat.Bar('training')",
     "Protocol": "a protocol, such as animat.Protocol(trials=5)",
     "Readouts": "readouts, such as 'halves'",
     "Recording": "a recording, as animat.read_recording returns",
@@ -46,6 +47,7 @@ _ONE = {
 }
 """What a kind is called in a message, and where one comes from."""
 _SEVERAL = {
+    "Actor by name": "agents by name, such as {'mine': Rule()}",
     "str": "a list of names",
     "str by name": "text by name",
     "Finding": "a list of findings",
@@ -112,7 +114,8 @@ def _unfitting(value: Any, hint: Any) -> list[Any]:
     if issubclass(kind, tuple) and Ellipsis not in inner:
         return [] if isinstance(value, Iterable) else [value]
     if getattr(kind, "_is_protocol", False):
-        fits = "__call__" not in vars(kind) or callable(value)
+        methods = [name for name in vars(kind) if not name.startswith("_")]
+        fits = all(hasattr(value, name) for name in methods) and ("__call__" not in vars(kind) or callable(value))
     elif inner and issubclass(kind, Mapping):
         if isinstance(value, Mapping):
             pairs = [pair for item in value.items() for pair in zip(item, inner, strict=True)]

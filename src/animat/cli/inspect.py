@@ -142,7 +142,8 @@ class Inspect(ResponseOptions):
             print(f"no figures of the series: {unlike}")
             return {}
         if drawn:
-            print(f"figures of the series: {', '.join(map(str, drawn))}")
+            of = "figures of the series" if len(files) > 1 else "figure of the array"
+            print(f"{of}: {', '.join(map(str, drawn))}")
         return {"figures": [str(figure) for figure in drawn]}
 
 

@@ -159,7 +159,7 @@ class Run(StimulationOptions):
         if not self.recordings:
             raise InvalidArgument(
                 "--recordings: expected those that the policies were trained on, got none: make some with "
-                "`animat record`, and train on them"
+                "`animat record` and train on them, or name those that there are"
             )
         in_jax = {"--interventions": self.interventions, "--controls coupling": self.controls == "coupling"}
         for option in (option for option, is_given in in_jax.items() if is_given):
