@@ -10,6 +10,7 @@ import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import jax
 import jax.numpy as jnp
@@ -224,9 +225,12 @@ def test_an_agent_outside_jax_is_evaluated_as_one_in_jax_and_a_policy_as_itself(
 def test_an_agent_that_cannot_act_is_refused_in_one_line(name: str, agent: Any, message: str) -> None:
     timeline = five_conditions()
     policy = policy_of(timeline, Cartpole(episode_limit=30))
+    seen = Mock()
     with pytest.raises(InvalidArgument, match=message) as refused:
-        evaluate({"p0": policy}, timeline, episodes=3, controls=[], agents={name: agent})
+        evaluate({"p0": policy}, timeline, episodes=3, controls=[], agents={name: agent}, progress=seen)
     assert "\n" not in str(refused.value)
+    # Before the policies have had their episodes.
+    assert not seen.update.called or isinstance(agent, BeginsWith)
     # The next one is not blamed for it.
     evaluate({"p0": policy}, timeline, episodes=3, controls=[], agents={"mine": Plain()})
 

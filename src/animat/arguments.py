@@ -114,8 +114,8 @@ def _unfitting(value: Any, hint: Any) -> list[Any]:
     if issubclass(kind, tuple) and Ellipsis not in inner:
         return [] if isinstance(value, Iterable) else [value]
     if getattr(kind, "_is_protocol", False):
-        methods = [name for name in vars(kind) if not name.startswith("_")]
-        fits = all(hasattr(value, name) for name in methods) and ("__call__" not in vars(kind) or callable(value))
+        is_checkable = getattr(kind, "_is_runtime_protocol", False)
+        fits = isinstance(value, kind) if is_checkable else "__call__" not in vars(kind) or callable(value)
     elif inner and issubclass(kind, Mapping):
         if isinstance(value, Mapping):
             pairs = [pair for item in value.items() for pair in zip(item, inner, strict=True)]

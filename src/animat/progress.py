@@ -7,7 +7,7 @@ import sys
 import threading
 import time
 from collections import deque
-from typing import TYPE_CHECKING, Protocol, Self
+from typing import TYPE_CHECKING, Protocol, Self, runtime_checkable
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -27,6 +27,7 @@ _FEWEST_MOVED = 0.01
 """Share of all work that must be done before anything can be said about the rest."""
 
 
+@runtime_checkable
 class Progress(Protocol):
     """What long work reports to: how much of it is done, and a few words on how it is going."""
 

@@ -13,7 +13,7 @@ from jaxtyping import Array
 
 from animat.environment import Environment, Neurons
 from animat.errors import InvalidArgument, first_line, shown, some_of, within
-from animat.evaluation.controllers import Called, Controller, acts, expect_condition, sees_neurons
+from animat.evaluation.controllers import Called, Controller, Turns, acts, expect_condition, sees_neurons
 from animat.evaluation.controls import OWN, Control
 from animat.evaluation.rollouts import Actor, Seen, Uniforms, trace
 from animat.registry import imported
@@ -40,8 +40,8 @@ def controls_of_own(
 ) -> list[Control]:
     """Agents of one's own as controls.
 
-    Raises InvalidArgument for one that cannot act in this environment, tried for some episodes if it is in JAX, and for
-    a name that is `taken`.
+    Raises InvalidArgument for one that cannot act in this environment, tried for some episodes if it is in JAX and at
+    the start of one otherwise, and for a name that is `taken`.
     """
     if agents and environment.n_actions is None:
         raise InvalidArgument("agents: expected none, as these policies choose from no conditions, got some")
@@ -63,8 +63,17 @@ def controls_of_own(
             raise InvalidArgument(f"agents: {name}: expected one that sees the robot only, got {got}")
         else:
             actor = Called(agent)
+            if not isinstance(environment.robot, HostRobot):
+                _ask_once(name, actor, environment)
         controls.append(Control(name, OWN, actor))
     return controls
+
+
+def _ask_once(name: str, called: Called, environment: Environment[Any]) -> None:
+    """Raise InvalidArgument for a controller that cannot act at the start of an episode, before others have theirs."""
+    seen = np.asarray(environment.observe(environment.reset(jax.random.key(0))))
+    with within(f"agents: {name}"):
+        Turns(called, environment).choose(seen[None], np.zeros((1, 1), np.float32), np.ones(1, bool))
 
 
 def _expect_actions(name: str, actor: Actor, environment: Environment[Any], simulator: Neurons) -> None:
