@@ -438,6 +438,27 @@ def test_an_agent_is_not_asked_after_its_episode() -> None:
     assert np.ptp(row.episodes.lengths) > 0
 
 
+@pytest.mark.parametrize("is_on_host", [False, True])
+def test_an_agent_is_asked_in_each_iteration_of_its_episodes_and_its_first_answers_again(is_on_host: bool) -> None:
+    asked = 0
+
+    class Counted:
+        def act(self, observation: np.ndarray, rng: np.random.Generator) -> int:
+            nonlocal asked
+            asked += 1
+            return int(rng.integers(5))
+
+    timeline = five_conditions()
+    policies = {"p0": slider_of(timeline) if is_on_host else policy_of(timeline, Cartpole(episode_limit=40))}
+    row = evaluate(policies, timeline, episodes=4, controls=[], agents={"it": Counted()}).rows[1]
+    lengths = row.episodes.lengths.ravel()
+    assert np.ptp(lengths) > 0 or is_on_host
+    # In JAX it is tried once before.
+    assert asked == lengths.sum() + min(20, lengths[0]) + (not is_on_host)
+    with pytest.raises(InvalidArgument, match=r"agents: mine: act: expected one condition for .*, got 0, then 4: draw"):
+        evaluate(policies, timeline, episodes=4, controls=[], agents={"mine": Counting()})
+
+
 class OnlyBegins:
     def begin(self) -> Plain:
         return Plain()
