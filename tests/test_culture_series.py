@@ -65,6 +65,10 @@ def copied(files: list[Path], to: Path) -> Path:
     return to
 
 
+def test_there_are_two_recordings_by_default(tmp_path: Path) -> None:
+    assert len(record_series(lambda: small_culture(), SHORT, tmp_path, interval_min=1.0).files) == 2
+
+
 def test_a_series_has_its_recordings_at_their_minutes(undisturbed: list[Path]) -> None:
     folder = undisturbed[0].parent
     assert [file.name for file in undisturbed] == [f"recording_{m:04}_min.nwb" for m in (0, 1, 2)]

@@ -106,6 +106,8 @@ def along(goal: str, xs: list[float], limit: int = 4) -> tuple[list[float], list
         # What only pays on the way does not decide, not even where the episode fails.
         ("reach x above 0.5 m; avoid x below -0.5 m; drive x in 0.4..0.5 m", [0.45, -0.55], [-1 / 3, -104], True, False,
          [97.5, 25, 25], -0.025),
+        ("reach x above 0.5 m; avoid x below -0.5 m; drive x in 0.4..0.5 m within 9", [0.45, -0.55], None, True, False,
+         None, -0.025),
         ("reach x above 0.5 m; drive x in -0.1..0.1 m within 3", [0.9], None, True, True, None, 0.2),
         # It may fail in the iteration in which it reaches; and beside an open edge it is not inside.
         ("reach x above 0.5 m; drive x in -0.1..0.1 m within 1", [0.2, 0.9], None, True, False, None, -0.4),

@@ -74,7 +74,7 @@ def record_series(
         protocol: of every recording, or a function that returns it for the culture, which is not yet open; the order of
             stimuli differs from recording to recording.
         folder: where the files go; created if it is missing.
-        sessions: number of recordings; by default as many as a closed loop needs.
+        sessions: number of recordings; by default two, as `animat record` makes.
         interval_min: minutes between the starts of two recordings.
         seed: of the orders of stimuli; zero or more. None: a virtual culture's own, 1 for any other.
         progress: updated after each block.

@@ -16,7 +16,7 @@ from animat.errors import InvalidArgument, first_line, shown
 _GRID = 2**24
 """Uniforms of single precision are multiples of 1 / 2^24."""
 _ASKED_AGAIN = 20
-"""So many decisions of a roll-out are asked for again at its end."""
+"""So many decisions are asked for again at the end of a roll-out, or of each wave of bodies on the host."""
 
 
 class Controller(Protocol):
@@ -71,8 +71,8 @@ class Called:
     n_actors: ClassVar[int] = 1
 
 
-class Turns:
-    """A controller in the episodes of one roll-out, which take turns.
+class CalledEpisodes:
+    """A controller in the episodes of one roll-out or wave, which take turns.
 
     InvalidArgument is raised for what its controller raises, Ctrl-C excepted.
     """

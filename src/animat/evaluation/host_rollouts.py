@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Key, PRNGKeyArray
 from animat.compilation import COMPILER_OPTIONS
 from animat.environment import Environment, Neurons, State
 from animat.errors import InvalidArgument
-from animat.evaluation.controllers import Called, Turns
+from animat.evaluation.controllers import Called, CalledEpisodes
 from animat.robots.host import Bodies, HostRobot, StepResult
 from animat.robots.starts import Starts
 
@@ -136,14 +136,14 @@ def _iterations(
     shape = len(keys), len(bodies) // len(keys)
     state = _started(environment, keys, shape[1])
     going = np.tile(np.arange(shape[1]) < n, (len(keys), 1))
-    turns = Turns(actors, environment) if isinstance(actors, Called) else None
+    called = CalledEpisodes(actors, environment) if isinstance(actors, Called) else None
     for iteration in range(environment.robot.episode_limit):
         state, number = state._replace(robot=bodies.observation.reshape(*shape, -1)), np.int32(iteration)
-        if turns is None:
+        if called is None:
             command, state, delivered = _iteration(environment, simulator, actors, keys, number, state)
         else:
             *seen, noise = _look_in_jit(environment, keys, number, state)
-            chosen = turns.choose(*(np.asarray(each[0]) for each in (*seen, going)))
+            chosen = called.choose(*(np.asarray(each[0]) for each in (*seen, going)))
             command, state, delivered = _respond_in_jit(environment, simulator, state, chosen[None], noise)
         stepped = bodies.step(np.asarray(command).reshape(len(bodies), -1))
         yield np.asarray(command), np.asarray(delivered), stepped
@@ -152,8 +152,8 @@ def _iterations(
             break
         if stepped.ended.any():
             bodies.begin(np.flatnonzero(stepped.ended).tolist())
-    if turns is not None:
-        turns.end()
+    if called is not None:
+        called.end()
 
 
 def _bodies(robot: HostRobot, seeds: Sequence[tuple[int, ...]]) -> Bodies:

@@ -13,7 +13,7 @@ from jaxtyping import Array
 
 from animat.environment import Environment, Neurons
 from animat.errors import InvalidArgument, first_line, shown, some_of, within
-from animat.evaluation.controllers import Called, Controller, Turns, acts, expect_condition, sees_neurons
+from animat.evaluation.controllers import Called, CalledEpisodes, Controller, acts, expect_condition, sees_neurons
 from animat.evaluation.controls import OWN, Control
 from animat.evaluation.rollouts import Actor, Seen, Uniforms, trace
 from animat.registry import imported
@@ -73,7 +73,7 @@ def _ask_once(name: str, called: Called, environment: Environment[Any]) -> None:
     """Raise InvalidArgument for a controller that cannot act at the start of an episode, before others have theirs."""
     seen = np.asarray(environment.observe(environment.reset(jax.random.key(0))))
     with within(f"agents: {name}"):
-        Turns(called, environment).choose(seen[None], np.zeros((1, 1), np.float32), np.ones(1, bool))
+        CalledEpisodes(called, environment).choose(seen[None], np.zeros((1, 1), np.float32), np.ones(1, bool))
 
 
 def _expect_actions(name: str, actor: Actor, environment: Environment[Any], simulator: Neurons) -> None:

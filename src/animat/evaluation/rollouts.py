@@ -17,7 +17,7 @@ from animat.compilation import COMPILER_OPTIONS
 from animat.environment import Environment, Neurons, State
 from animat.errors import InvalidArgument, expect_at_least, shown
 from animat.evaluation.commands import mean_commands
-from animat.evaluation.controllers import Called, Turns
+from animat.evaluation.controllers import Called, CalledEpisodes
 from animat.evaluation.host_rollouts import roll_out_on_host
 from animat.goals.robot import RobotWithGoal
 from animat.goals.tally import Outcome
@@ -322,15 +322,15 @@ def _roll_out_called(
     starts: Key[Array, " episodes"] | None,
 ) -> tuple[Any, ...]:
     """The same for a controller outside JAX, with the same random numbers."""
-    turns = Turns(called, environment)
+    called_episodes = CalledEpisodes(called, environment)
     course, of_iteration = _begin_in_jit(environment, episodes, simulator, key, starts)
     for each in of_iteration:
         observation, uniforms, noise = _look_in_jit(environment, course, each)
-        chosen = turns.choose(*map(np.asarray, (observation, uniforms, course.going)))
+        chosen = called_episodes.choose(*map(np.asarray, (observation, uniforms, course.going)))
         course = _advance_in_jit(environment, simulator, course, chosen, noise)
         if not np.any(course.going):
             break
-    turns.end()
+    called_episodes.end()
     return _results(environment, jax.tree.map(lambda part: part[None], course))
 
 

@@ -88,7 +88,7 @@ def evaluate(
     meaning = "as trained: the delivered condition is drawn at random" if is_control else "as trained"
     trained = Control("policies", meaning, networks, delivery="shuffled" if is_control else "chosen")
     all_controls = controls_of(*within, _labels(first), networks)
-    controls = _expect_controls(controls, [each.name for each in all_controls])
+    controls = _names_of_controls(controls, [each.name for each in all_controls])
     acting = [trained, *(control for control in all_controls if controls is None or control.name in controls)]
     acting += controls_of_own(
         agents or {}, *within, ["policies", "coupling", *policies, *(each.name for each in all_controls)]
@@ -148,7 +148,7 @@ def _labels(policy: Policy) -> list[str]:
     return [condition.label for condition in policy.conditions]
 
 
-def _expect_controls(wanted: str | Collection[str] | None, known: Sequence[str]) -> Collection[str] | None:
+def _names_of_controls(wanted: str | Collection[str] | None, known: Sequence[str]) -> Collection[str] | None:
     """The names of the controls to run, None for all; raises InvalidArgument for an unknown one."""
     if wanted is None:
         return None

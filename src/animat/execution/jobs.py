@@ -226,7 +226,7 @@ def _expect_success(future: Future[TaskResult], job: Job) -> None:
         error.args = (f"{job.name}: {error}",)
         raise
     except CancelledError as error:
-        ended = "its executor (of a cluster: the scheduler) has ended; start it, then run this again to continue"
+        ended = "its executor, or the cluster's scheduler, has ended; start it, then run this again to continue"
         raise AnimatError(f"{job.name}: {ended}") from error
     except Exception as error:
         # Raised by the executor: a process ended, or a machine was lost.

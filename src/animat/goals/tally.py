@@ -104,8 +104,10 @@ def outcome(objectives: Sequence[Objective], tally: Tally, episode_limit: int) -
     satisfaction = jnp.where(avoids, avoided, jnp.where(reaches, 1.0 + jnp.minimum(margins, 0.0), there))
     if reaches.any():
         # Reaching a region ends the episode, and suffices unless the episode has failed.
-        late = np.array([objective.within is not None for objective in objectives])
-        decides = avoids | (late & tally.failed)
+        # An episode that failed without entering a region to avoid was too long outside of one to drive to.
+        limited = np.array([objective.within is not None for objective in objectives])
+        is_late = tally.failed & ~jnp.any(avoids & (tally.inside > 0))
+        decides = avoids | (limited & is_late)
         met, margin = tally.reached, jnp.min(margins, where=decides, initial=jnp.max(margins[reaches]))
     else:
         met, margin = jnp.all(tally.is_inside | avoids), jnp.min(margins)

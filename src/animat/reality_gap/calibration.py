@@ -203,7 +203,10 @@ def _own_recordings(
 
 
 def _last_minute(timeline: SimulatorTimeline, policy: Policy | None) -> float:
-    """The minute of the last simulator that a policy was trained on; of the last recording without a policy."""
+    """The minute of the last simulator that a policy was trained on; of the last recording without a policy.
+
+    It is that of the first recording for a policy that does not know its own.
+    """
     first_min, last_min = (float(timeline.start_min[i]) for i in (0, -1))
     if policy is None:
         return last_min

@@ -143,7 +143,7 @@ def predict(
 def _prediction(
     returns: Float64[np.ndarray, "roll_outs actors episodes"], commanded: CommandSums, rounds: int
 ) -> Prediction:
-    """From roll-outs of an agent's actors: the first on the recording's simulator, each other one on a bootstrap."""
+    """From roll-outs of an agent's actors, `ROLL_OUTS` on the recording's simulator, then one on each bootstrap."""
     from_starts = returns.reshape(len(returns), -1, rounds)
     each = commanded.summed(1)
     return Prediction(

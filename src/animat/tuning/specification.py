@@ -119,9 +119,10 @@ def read_space(table: Mapping[str, Any], study: Study) -> Space:
         if name not in FITTING:
             _expect_possible(study, name, space[name], where)
         if own[name] not in space[name]:
+            remedy = f"{'widen the range' if isinstance(among, dict) else 'add it'}, or change {name} in the study"
             raise InvalidArgument(
                 f"{where}: expected it to include the study's own setting, {own[name]!r}, which is tried first; got "
-                f"{shown(among)}: add it, or change {name} in the study"
+                f"{shown(among)}: {remedy}"
             )
     for chosen in itertools.product(*(choices_of(name, space, study) for name in FITTING)):
         with within("tune.search"):

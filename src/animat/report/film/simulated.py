@@ -104,6 +104,6 @@ def _environment(
 
 
 def _period_s(condition: Condition, presentation: Presentation | None) -> float:
-    """How long a trial of a condition takes; that of an iteration without neurons if its frequency is not known."""
+    """How long a trial of a condition takes; if its frequency is not known, its pulses count as iterations."""
     pulses = 1 if presentation is None else presentation.pulses
     return pulses / (condition.frequencies_hz or (1 / _WITHOUT_NEURONS_S,))[0]

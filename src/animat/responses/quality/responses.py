@@ -151,7 +151,7 @@ def _timing(
         return
     yield from _dead_conditions(responses, recording, assignment, per_stimulus)
     if response is not None:
-        yield from _place_of(response, start_ms, end_ms)
+        yield from _window_findings(response, start_ms, end_ms)
 
 
 def _overlapping(stimuli: Stimuli, end_ms: float) -> Iterator[Finding]:
@@ -170,7 +170,7 @@ def _overlapping(stimuli: Stimuli, end_ms: float) -> Iterator[Finding]:
         yield Finding("stimuli-too-close", "warning", message, float(overlapping))
 
 
-def _place_of(response: ResponseTime, start_ms: float, end_ms: float) -> Iterator[Finding]:
+def _window_findings(response: ResponseTime, start_ms: float, end_ms: float) -> Iterator[Finding]:
     """A finding on when the response comes, within the window or outside."""
     if response.start_ms >= end_ms or response.end_ms <= start_ms:
         message = (
