@@ -8,14 +8,11 @@ import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, fields, replace
-from typing import Any, Self, TypeVar
-
-import numpy as np
-from jaxtyping import Float64
+from dataclasses import fields, replace
+from typing import Any, TypeVar
 
 from animat.arguments import checked_arguments
-from animat.closed_loop.agents import Agent, Greedy, agent_of
+from animat.closed_loop.agents import Greedy
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.runner import starts_of
 from animat.closed_loop.running import check_session, run_session
@@ -24,16 +21,15 @@ from animat.cultures.base import Culture
 from animat.cultures.budget import Account
 from animat.cultures.failures import describe_error
 from animat.cultures.same_culture import differences
-from animat.environment import Animat, Environment
+from animat.environment import Animat
 from animat.errors import InvalidArgument, InvalidFile, UnusableData, did_you_mean, expect_at_least
 from animat.evaluation import transfer
 from animat.evaluation.controllers import Controller
-from animat.evaluation.controls import RANDOM, Control, controls_of, coupling_of, interventions_of
+from animat.evaluation.controls import RANDOM, coupling_of
 from animat.evaluation.optimal_returns import too_few
 from animat.evaluation.optimum import optimal_values
 from animat.evaluation.own_agents import controls_of_own
-from animat.evaluation.rollouts import Actor, Networks, networks_of
-from animat.neurons.simulator import NeuronSimulator
+from animat.evaluation.rollouts import Actor
 from animat.progress import Progress, in_phase
 from animat.reality_gap.calibration import Calibration
 from animat.reality_gap.measuring import session_rows
@@ -41,14 +37,14 @@ from animat.reality_gap.outlook import Outlook, outlook
 from animat.reality_gap.predicting import EPISODES, MOST_ON_HOST, few_predicted, pool, predict
 from animat.reality_gap.reasons import Evidence, reasons
 from animat.reality_gap.session_responses import read_responses
-from animat.reality_gap.table import INTERVENTION_EPISODES, RealityGap, intervention_table
+from animat.reality_gap.simulation import Simulation
+from animat.reality_gap.table import RealityGap, intervention_table
 from animat.recordings.findings import Finding, warnings_once
 from animat.robots.base import Robot, lacking
 from animat.robots.grid import grid_of_optimum, why_no_grid
 from animat.robots.host import HostRobot
 from animat.robots.starts import Starts
 from animat.training.policy import Policy, first_of_alike
-from animat.wrappers import NeuralObservation
 from animat.writing import expect_writable
 
 T = TypeVar("T")
@@ -126,7 +122,7 @@ def run_policies(
     called = [name for name, agent in (agents or {}).items() if not isinstance(agent, Actor)]
     findings += tuple(_warnings(representative, loop, calibration, age_min, starts, called))
     account = account or Account()
-    simulation = _Simulation.of(policies, loop, calibration, greedy=greedy, seed=seed, starts=starts)
+    simulation = Simulation.of(policies, loop, calibration, greedy=greedy, seed=seed, starts=starts)
     controls = [RANDOM]
     if with_controls:
         if "heuristic" in (lacks := lacking(loop.robot)):
@@ -232,65 +228,6 @@ def _loop_of(
     if calibration.recording is not None:
         unknown += differences(calibration.recording, culture, patterns_too=loop.encoder.takes_patterns)
     return loop, unknown + unlike_policy
-
-
-@dataclass(frozen=True, eq=False)
-class _Simulation:
-    """The trained policies, and the simulator of the calibrating recording, on which controls are prepared."""
-
-    trained: Control
-    networks: Networks
-    animat: Animat[Any]
-    environment: Environment[Any]
-    simulator: NeuronSimulator
-    seed: int
-    starts: Starts | None
-
-    @classmethod
-    def of(
-        cls,
-        policies: Mapping[str, Policy],
-        loop: Loop,
-        calibration: Calibration,
-        *,
-        greedy: bool,
-        seed: int,
-        starts: Starts | None,
-    ) -> Self:
-        animat = Animat(loop.robot, loop.mapping, len(loop.conditions))
-        sees_neurons = next(iter(policies.values())).neural_observation
-        environment: Environment[Any] = NeuralObservation(animat) if sees_neurons else animat
-        networks = networks_of(list(policies.values()), greedy=greedy)
-        trained = Control("policies", "as trained", networks)
-        return cls(trained, networks, animat, environment, calibration.simulator, seed, starts)
-
-    @property
-    def within(self) -> tuple[Environment[Any], NeuronSimulator]:
-        return self.environment, self.simulator
-
-    def controls(self, labels: Sequence[str]) -> list[Control]:
-        """All controls; the heuristic stays last, as random numbers depend on the place."""
-        return sorted(controls_of(*self.within, labels, self.networks), key=lambda control: control.name == "heuristic")
-
-    def interventions(self) -> tuple[list[Control], tuple[Control, Float64[np.ndarray, " episodes"]]]:
-        """The interventions that a loop can run, and the ideal actuator with its returns on the simulator."""
-        if isinstance(robot := self.environment.robot, HostRobot):
-            got = f"{robot.name}, which is stepped outside JAX"
-            raise InvalidArgument(f"--interventions: expected a robot in JAX, got {got}")
-        simulated: dict[str, Any] = {"episodes": INTERVENTION_EPISODES, "seed": self.seed, "starts": self.starts}
-        half_way = self.trained.run(*self.within, **simulated).half_way
-        actuator, *changed = interventions_of(*self.within, self.networks, switch_at=half_way)
-        returns = actuator.run(*self.within, **simulated).returns.ravel()
-        # The other two are controls already.
-        return [each for each in changed if each.name not in ("silent", "shuffled")], (actuator, returns)
-
-    def agents(
-        self, policies: Mapping[str, Controller], controls: Sequence[Control], calibration: Calibration
-    ) -> list[Agent]:
-        """Those that take turns in the loop: the policies, then the controls."""
-        pooled = np.concatenate(calibration.responses_hz)
-        own = [Agent(name, self.trained.meaning, controller) for name, controller in policies.items()]
-        return own + [agent_of(control, self.animat, policies, pooled) for control in controls]
 
 
 @contextmanager
