@@ -214,6 +214,7 @@ def test_an_agent_outside_jax_is_evaluated_as_one_in_jax_and_a_policy_as_itself(
         pytest.param(
             "mine", Tabular(jnp.arange(5)), r"first axis of length one, got the shapes \(5,\)", marks=pytest.mark.oracle
         ),
+        ("mine", Plain, "agents: mine: expected an instance, got the class Plain: create one"),
         ("p0", Plain(), "agents: expected names other than .*, got p0"),
         pytest.param("mine", 3, "agents: mine: expected an Actor, or a method `act`, got 3", marks=pytest.mark.oracle),
         pytest.param("random", Plain(), "agents: expected names other than .*, got random", marks=pytest.mark.oracle),

@@ -51,6 +51,8 @@ def controls_of_own(
             raise InvalidArgument(f"agents: expected names other than {some_of(sorted(taken))}, got {name}")
         if not name.strip():
             raise InvalidArgument(f"agents: expected a name for each, got {name!r}")
+        if isinstance(agent, type):
+            raise InvalidArgument(f"agents: {name}: expected an instance, got the class {agent.__name__}: create one")
         if not acts(agent):
             raise InvalidArgument(f"agents: {name}: expected an Actor, or a method `act`, got {shown(agent)}")
         has_neurons = len(environment.observation_spec) > len(environment.robot.observation_spec)
