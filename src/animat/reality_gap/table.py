@@ -173,7 +173,8 @@ class RealityGap:
         lines += [
             f"  {self.verdict()}",
             "  its 95 % interval: of the number on its left; p value: of the two-sided Mann-Whitney test of the "
-            "policies' returns against this control's; electrode pulses: per whole episode, one for each electrode of each pulse",
+            "policies' returns against this control's; electrode pulses: per whole episode, one for each electrode of "
+            "each pulse",
             f"  stimulation: {self.account}",
             f"  ticks: {outline.ticks}, bursts: {outline.bursts}, late pulses: {outline.late}"
             f" (the latest {1000 * outline.latest_s:.1f} ms); ended: {self.session.ending.message}",
