@@ -111,8 +111,8 @@ class WellSampled:
 def with_enough_samples(responses: Responses) -> tuple[Responses, tuple[str, ...]]:
     """Responses to the conditions with 30 or more non-burst responses, and the other conditions, with their number.
 
-    The best of several values is likely a lucky one: three responses promise too much. With 30, nine of ten intervals
-    contain the true optimum, with 10 four of five (docs/evidence/optimal-return.md). UnusableData if none has 30.
+    The best of several values is likely a lucky one: a few responses promise too much, and the optimum's interval is as
+    wide as the range of returns (docs/evidence/optimal-return.md). UnusableData if none has 30.
     """
     n = [len(responses.rates_of(i)) for i in range(len(responses.conditions))]
     few = too_few(responses.conditions, n)
