@@ -9,10 +9,10 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Sequence
 from dataclasses import replace
-
-import numpy as np
+from pathlib import Path
 
 from animat import Animat, Cartpole, Linear, Navigation, Thresholds, WithoutNeurons, best_returns
 from animat.environment import Environment
@@ -21,7 +21,6 @@ from animat.evaluation.optimum import Optimum, best_return
 from animat.evaluation.rollouts import Uniform, roll_out
 from animat.neurons.simulator import NeuronSimulator, fit_histogram
 from animat.neurons.synthetic import synthetic_simulator
-from animat.responses.condition import Condition
 from animat.responses.responses import Responses
 
 EPISODES = 4000
@@ -82,19 +81,10 @@ def coverage(series: int) -> None:
 
 def drawn(n: int, spread: Sequence[float], seed: int) -> Responses:
     """n responses to each condition from gamma distributions of shape 3, with means of 15 Hz times `spread`."""
-    condition = np.repeat(np.arange(len(spread)), n)
-    rate_hz = np.random.default_rng(seed).gamma(3.0, 5.0, len(condition)) * np.array(spread)[condition]
-    return Responses(
-        condition=condition,
-        rate_hz=rate_hz,
-        active_ratio=np.full(len(condition), 0.1),
-        is_burst=np.zeros(len(condition), bool),
-        conditions=tuple(Condition(f"{f} Hz", f, "Hz") for f in (5, 10, 20, 40, 80)[: len(spread)]),
-        window_ms=(2.0, 10.0),
-        n_channels=1024,
-        threshold=1.0,
-        separability=0.5,
-    )
+    sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
+    from test_optimal_returns import answers
+
+    return answers([n] * len(spread), seed, spread)
 
 
 def _case(responses: Responses) -> tuple[Animat, NeuronSimulator]:

@@ -170,13 +170,12 @@ def _started(environment: Environment[Any], keys: Key[Array, " actors"], episode
     return jax.vmap(lambda key: jax.vmap(environment.reset)(jax.random.split(key, episodes)).carried)(keys)
 
 
-def _look(
-    environment: Environment[Any], iteration: Array, key: PRNGKeyArray, state: State
+def look(
+    environment: Environment[Any], state: State, key: PRNGKeyArray
 ) -> tuple[Float[Array, "episodes observations"], Float[Array, "episodes drawn"], Float[Array, "episodes noise"]]:
-    """Observations (scaled), and uniforms for an actor and for the environment."""
-    n, n_drawn = len(state.iteration), environment.n_drawn
-    shape = n, n_drawn + environment.noise_size
-    uniforms = jax.random.uniform(jax.random.fold_in(key, iteration), shape, np.float32)
+    """Observations (scaled) of episodes side by side, and uniforms for an actor and for the environment."""
+    n_drawn = environment.n_drawn
+    uniforms = jax.random.uniform(key, (len(state.iteration), n_drawn + environment.noise_size), np.float32)
     return jax.vmap(environment.observe)(state) / environment.scales, uniforms[:, :n_drawn], uniforms[:, n_drawn:]
 
 
@@ -199,7 +198,7 @@ def _iteration(
     state: State,
 ) -> tuple[Float[Array, "actors episodes *commands"], State, Array]:
     def of_actor(actor: Any, key: PRNGKeyArray, state: State) -> tuple[Array, State, Array]:
-        observation, uniforms, noise = _look(environment, iteration, key, state)
+        observation, uniforms, noise = look(environment, state, jax.random.fold_in(key, iteration))
         return _respond(environment, simulator, state, actor.act(environment, observation, uniforms), noise)
 
     return jax.vmap(of_actor)(actors, keys, state)
@@ -209,8 +208,9 @@ def _iteration(
 def _look_in_jit(
     environment: Environment[Any], keys: Key[Array, " actors"], iteration: Array, state: State
 ) -> tuple[Array, ...]:
-    """As `_look` for each actor, with observations in the robot's own units."""
-    observation, *uniforms = jax.vmap(partial(_look, environment, iteration))(keys, state)
+    """As `look` for each actor, with observations in the robot's own units."""
+    folded = jax.vmap(jax.random.fold_in, (0, None))(keys, iteration)
+    observation, *uniforms = jax.vmap(partial(look, environment))(state, folded)
     return observation * environment.scales, *uniforms
 
 

@@ -18,7 +18,7 @@ from animat.environment import Environment, Neurons, State
 from animat.errors import InvalidArgument, expect_at_least, shown
 from animat.evaluation.commands import mean_commands
 from animat.evaluation.controllers import Called, CalledEpisodes
-from animat.evaluation.host_rollouts import roll_out_on_host
+from animat.evaluation.host_rollouts import look, roll_out_on_host
 from animat.goals.robot import RobotWithGoal
 from animat.goals.tally import Outcome
 from animat.neurons.simulator import stacked
@@ -258,14 +258,6 @@ def _begin(
     return course, jax.random.split(key, environment.robot.episode_limit)
 
 
-def _look(environment: Environment[Any], course: _Course, key: PRNGKeyArray) -> tuple[Seen, Uniforms, Array]:
-    """Observations (scaled), and uniforms for an actor and for the environment."""
-    n_drawn = environment.n_drawn
-    uniforms = jax.random.uniform(key, (len(course.going), n_drawn + environment.noise_size), jnp.float32)
-    observation = jax.vmap(environment.observe)(course.state) / environment.scales
-    return observation, uniforms[:, :n_drawn], uniforms[:, n_drawn:]
-
-
 def _advance(
     environment: Environment[Any], simulator: Neurons, course: _Course, action: Array, noise: Array
 ) -> _Course:
@@ -299,7 +291,7 @@ def _roll_out(
     starts: Key[Array, " episodes"] | None,
 ) -> tuple[Any, ...]:
     def iteration(course: _Course, actor: Actor, key: PRNGKeyArray) -> _Course:
-        observation, uniforms, noise = _look(environment, course, key)
+        observation, uniforms, noise = look(environment, course.state, key)
         return _advance(environment, simulator, course, actor.act(environment, observation, uniforms), noise)
 
     # The loop is outside the `vmap` and ends with the last episode: controls fail long before the limit.
@@ -340,8 +332,8 @@ _advance_in_jit = jax.jit(_advance, static_argnums=0, compiler_options=COMPILER_
 
 @partial(jax.jit, static_argnums=0, compiler_options=COMPILER_OPTIONS)
 def _look_in_jit(environment: Environment[Any], course: _Course, key: PRNGKeyArray) -> tuple[Seen, Uniforms, Array]:
-    """As `_look`, with observations in the robot's own units."""
-    observation, uniforms, noise = _look(environment, course, key)
+    """As `look`, with observations in the robot's own units."""
+    observation, uniforms, noise = look(environment, course.state, key)
     return observation * environment.scales, uniforms, noise
 
 

@@ -32,11 +32,11 @@ from animat.evaluation.own_agents import controls_of_own
 from animat.evaluation.rollouts import Actor
 from animat.progress import Progress, in_phase
 from animat.reality_gap.calibration import Calibration
-from animat.reality_gap.measuring import session_rows
 from animat.reality_gap.outlook import Outlook, outlook
 from animat.reality_gap.predicting import EPISODES, MOST_ON_HOST, few_predicted, pool, predict
 from animat.reality_gap.reasons import Evidence, reasons
 from animat.reality_gap.session_responses import read_responses
+from animat.reality_gap.session_rows import session_rows
 from animat.reality_gap.simulation import Simulation
 from animat.reality_gap.table import RealityGap, intervention_table
 from animat.recordings.findings import Finding, warnings_once
