@@ -39,9 +39,13 @@ def _add(app: Any, page: str, text: list[str]) -> None:
     if page == "docs/api":
         rooms: dict[str, list[str]] = {}
         for name, module in animat._MODULE_OF.items():
-            kind = "class" if inspect.isclass(getattr(animat, name)) else "function"
-            members = ["   :members:"] if kind == "class" else []
-            rooms.setdefault(module.split(".")[1], []).extend([f".. auto{kind}:: animat.{name}", *members, ""])
+            thing, room = getattr(animat, name), rooms.setdefault(module.split(".")[1], [])
+            if inspect.isclass(thing):
+                room.extend([f".. autoclass:: animat.{name}", "   :members:", ""])
+            elif callable(thing):
+                room.extend([f".. autofunction:: animat.{name}", ""])
+            else:
+                room.extend([f".. py:data:: animat.{name}", f"   :value: {thing}", ""])
         for room, lines in rooms.items():
             title = room.replace("_", " ").capitalize()
             text[0] += "\n".join(["", f"## {title}", "", "```{eval-rst}", *lines, "```", ""])

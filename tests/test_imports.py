@@ -171,8 +171,8 @@ def test_every_error_that_a_user_may_catch_is_public() -> None:
 def test_the_whole_story_is_public() -> None:
     import animat
 
-    story = ["Recording", "Protocol", "Selection", "Culture", "Limits", "VirtualCulture", "ReplayCulture", "Responses",
-             "NeuronSimulator", "Mapping", "Robot", "Animat", "train", "Policy", "evaluate", "Loop", "run_policies",
-             "Study"]  # fmt: skip
+    story = ["Recording", "Protocol", "Selection", "Culture", "Limits", "VirtualCulture", "ReplayCulture",
+             "MaxOneCulture", "CL1Culture", "Responses", "NeuronSimulator", "Mapping", "Robot", "Animat", "train",
+             "Policy", "evaluate", "Loop", "read_session", "run_policies", "Study"]  # fmt: skip
     assert [name for name in animat.__all__ if name in story] == story
     assert issubclass(animat.VirtualCulture, animat.Culture) and issubclass(animat.ReplayCulture, animat.Culture)

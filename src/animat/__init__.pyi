@@ -11,7 +11,8 @@ from animat.stimulation.protocol import (
     Protocol as Protocol,
     read_protocol as read_protocol,
 )
-from animat.stimulation.selection import Selection as Selection
+from animat.stimulation.pulse import PUBLISHED_PULSE as PUBLISHED_PULSE, BALANCED_PULSE as BALANCED_PULSE
+from animat.stimulation.selection import Selection as Selection, SelectionRule as SelectionRule
 from animat.recordings.findings import Finding as Finding
 from animat.recordings.reading import (
     read_recording as read_recording,
@@ -19,11 +20,14 @@ from animat.recordings.reading import (
     read_source as read_source,
 )
 from animat.recordings.formats.nwb import write_nwb as write_nwb
+from animat.recordings.conversion import Origin as Origin, convert_recording as convert_recording
 from animat.progress import Bar as Bar
 from animat.cultures.base import Culture as Culture
-from animat.cultures.safety import Limits as Limits
+from animat.cultures.safety import Limits as Limits, SIMULATED_LIMITS as SIMULATED_LIMITS
 from animat.cultures.virtual import VirtualCulture as VirtualCulture
 from animat.cultures.replay import ReplayCulture as ReplayCulture
+from animat.cultures.devices.maxone import MaxOneCulture as MaxOneCulture
+from animat.cultures.devices.cl1 import CL1Culture as CL1Culture
 from animat.cultures.series import record_series as record_series
 from animat.responses.condition import Condition as Condition
 from animat.responses.conditions import conditions_named as conditions_named
@@ -79,6 +83,7 @@ from animat.evaluation.optimum import Optimum as Optimum, best_return as best_re
 from animat.evaluation.optimal_returns import optimal_returns as optimal_returns
 from animat.evaluation.statistics import compare as compare
 from animat.closed_loop.loop import Loop as Loop
+from animat.closed_loop.session import read_session as read_session
 from animat.reality_gap import Calibration as Calibration, run_policies as run_policies
 from animat.studies.specification import Study as Study
 from animat.studies.paper import paper_study as paper_study

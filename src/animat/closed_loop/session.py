@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from animat.arguments import checked_arguments
 from animat.closed_loop.header import Header, read_header
 from animat.closed_loop.log import Log, open_file, read_log
 from animat.closed_loop.outline import Episode, Outline, count_electrode_pulses
@@ -228,6 +229,7 @@ def describe_left_out(left_out: Mapping[str, int]) -> str:
     return ", ".join(f"{count} {what}" for what, count in left_out.items())
 
 
+@checked_arguments
 def read_session(path: str | os.PathLike[str]) -> Session:
     """Read a session from its folder or its log, whatever ended it; InvalidFile if that is missing or damaged."""
     path = Path(path)

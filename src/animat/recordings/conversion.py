@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from animat.arguments import checked_arguments
 from animat.errors import InvalidArgument, InvalidFile
 from animat.progress import Progress
 from animat.recordings.detection.settings import Detection
@@ -87,6 +88,7 @@ class Origin:
             raise InvalidArgument(f"age: expected a range with the younger age first, got {self.age!r}")
 
 
+@checked_arguments
 def convert_recording(
     path: str | os.PathLike[str],
     out: str | os.PathLike[str],
