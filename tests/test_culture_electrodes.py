@@ -172,6 +172,9 @@ def test_electrodes_that_see_no_neuron_record_nothing(culture: VirtualCulture) -
 
 def test_stimulate_sees_what_a_delivery_sees() -> None:
     one, other = small_culture().open(), small_culture().open()
+    for window_ms in (5, (5,), (1.0, 2.0, 3.0)):
+        with pytest.raises(InvalidArgument, match="window_ms: expected a start and an end"):
+            one.stimulate(one.patterns[0].tolist(), PUBLISHED_PULSE, window_ms)  # type: ignore[arg-type]
     seen = one.stimulate(one.patterns[0].tolist(), PUBLISHED_PULSE, (2.0, 10.0))
     spikes = other.deliver([stimulus(other, 0.0)], 0.01).spikes
     inside = (spikes.time_s >= 0.002 - 1e-9) & (spikes.time_s < 0.010 - 1e-9)

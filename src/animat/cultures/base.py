@@ -180,7 +180,10 @@ class Culture(Openable):
         Raises:
             UnsafeStimulus, InvalidArgument, DeviceFailed: as `deliver` does.
         """
-        start_ms, end_ms = (number("window_ms", edge_ms) for edge_ms in window_ms)
+        edges_ms = tuple(window_ms) if isinstance(window_ms, Iterable) else ()
+        if len(edges_ms) != 2:
+            raise InvalidArgument(f"window_ms: expected a start and an end, such as (2.0, 10.0), got {window_ms!r}")
+        start_ms, end_ms = (number("window_ms", edge_ms) for edge_ms in edges_ms)
         if not 0 <= start_ms < end_ms < float("inf"):
             raise InvalidArgument(f"window_ms: expected a start from 0 and an end after it, got {window_ms}")
         observed = self.deliver([Stimulus(0.0, tuple(electrodes), pulse)], end_ms * 1e-3)

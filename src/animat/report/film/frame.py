@@ -15,6 +15,7 @@ from animat.report.colours import BLUE, ORANGE, RED, condition_colours
 from animat.report.film.scene import Moment, Scene
 from animat.robots.drawing import Picture, draw_robot
 from animat.robots.host import HostRobot
+from animat.robots.starts import robot_generator
 
 WIDTH_PX, HEIGHT_PX = 880, 440
 """Even, as video encoders require."""
@@ -228,7 +229,7 @@ class _Replay:
 
     def __init__(self, scene: Scene) -> None:
         self._moments, self._done = scene.moments, 0
-        self._runner = HostRunner(scene.robot, np.random.default_rng(scene.runner_seed), with_pictures=True)
+        self._runner = HostRunner(scene.robot, robot_generator(scene.seed), with_pictures=True)
         self._episode: int | None = None
         self._is_same = True
 

@@ -45,7 +45,7 @@ class Scene:
         moments: in order of time; those of the first episode from its start, so that a host robot can be replayed.
         n_channels: of the array; 0 without an array, when only responses are shown.
         lost_bytes: bytes at the end of a session's log that are torn or damaged and not shown.
-        runner_seed: of the runner that moved a host robot (`animat.closed_loop.runner.HostRunner`).
+        seed: of the session or film, which decides how a host robot starts.
     """
 
     title: str
@@ -59,4 +59,4 @@ class Scene:
     pulse_times_s: Float64[np.ndarray, " pulses"] = field(default_factory=lambda: np.empty(0))
     n_channels: int = 0
     lost_bytes: int = 0
-    runner_seed: tuple[int, int] = (0, 0)
+    seed: int = 0

@@ -81,7 +81,7 @@ def scene_of_session(path: str | os.PathLike[str], span_s: tuple[float, float] |
         pulse_times_s=np.array(reading.pulses_s, np.float64),
         n_channels=len(header.channels),
         lost_bytes=session.log.lost_bytes,
-        runner_seed=(seed, 22),
+        seed=seed,
     )
 
 

@@ -17,6 +17,7 @@ from animat.neurons.timeline import SimulatorTimeline
 from animat.report.film.scene import Moment, Scene
 from animat.report.film.session import USUAL_S
 from animat.responses.condition import Condition
+from animat.robots.starts import robot_generator
 from animat.stimulation.protocol import Presentation
 from animat.training.policy import Policy, first_of_alike
 from animat.wrappers import ShuffledDelivery
@@ -53,8 +54,7 @@ def scene_of_policies(
     environment, simulator = _environment(first, timeline, at_min)
     respond = jax.jit(environment.respond)
     state = environment.reset(jax.random.key(seed))
-    rng, runner_seed = np.random.default_rng([seed, 1]), (seed, 22)
-    runner = runner_of(robot, np.random.default_rng(runner_seed))
+    rng, runner = np.random.default_rng([seed, 1]), runner_of(robot, robot_generator(seed))
     time_s, moments = 0.0, list[Moment]()
     for episode, (name, policy) in enumerate(policies.items()):
         if time_s >= to_s:
@@ -86,7 +86,7 @@ def scene_of_policies(
     labels = tuple(condition.label for condition in first.conditions)
     through = "on the simulator" if simulator is not None else "without neurons"
     kept = tuple(each for each in moments if each.episode >= shown)
-    return Scene(f"{robot.name} {through}", robot, labels, kept, from_s, min(time_s, to_s), runner_seed=runner_seed)
+    return Scene(f"{robot.name} {through}", robot, labels, kept, from_s, min(time_s, to_s), seed=seed)
 
 
 def _environment(
