@@ -59,8 +59,9 @@ class TrainingView(View):
         if state["state"] == "running":
             per_s = self._speed.per_s
             speed = "being measured" if per_s is None else f"{per_s:,.0f}, all policies together"
+        finished = sum(part >= 1 for part in shares.values())
         rows: list[tuple[str, Any]] = [
-            ("policies", f"{planned:,}, of which {sum(part >= 1 for part in shares.values()):,} are done"),
+            ("policies", f"{planned:,}, of which {finished:,} {'is' if finished == 1 else 'are'} done"),
             ("iterations of each", iterations),
             ("done", f"{100 * done / max(1, planned):.0f} % of all"),
             ("iterations per second", speed),
