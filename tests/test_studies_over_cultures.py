@@ -32,7 +32,7 @@ from animat.studies.cultures import (
     studies_of,
     write_cultures_page,
 )
-from animat.studies.folder import RESULTS
+from animat.studies.folder import RESULTS, describe_study
 from animat.studies.results import write_typed
 from animat.studies.run import StudyRun, run_study
 from animat.studies.source import Source, read_seeds
@@ -193,6 +193,27 @@ def run_with_results(study: Study, folder: Path) -> StudyRun:
     rows = (compared(0.0, float(study.culture.seed or 0), SECOND),)
     write_typed(folder / RESULTS, Results((), rows, (), (), (), ()))
     return StudyRun(folder, folder / "report.html", 1, {})
+
+
+def test_another_study_is_refused_before_it_touches_the_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """More cultures may be added, and a study that stopped before it made anything may be corrected."""
+
+    def ran(study: Study, folder: Path, **_: Any) -> StudyRun:
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "study.json").write_text(json.dumps(describe_study(study, {})))
+        return run_with_results(study, folder)
+
+    monkeypatch.setattr(cultures, "run_study", ran)
+    study = replace(read_study(TINY), culture=Source(seeds="1-2"))
+    run_over_cultures(study, tmp_path)
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    with pytest.raises(Mismatch, match=r"culture-1: expected a folder of this study, got one of another \(study.policies"):
+        run_over_cultures(replace(study, policies=study.policies + 1), tmp_path)
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+    assert list(run_over_cultures(replace(study, culture=Source(seeds="1-3")), tmp_path).finished)[-1] == "culture-3"
+    for name in ("culture-1", "culture-2", "culture-3"):
+        shutil.rmtree((tmp_path / name / RESULTS).parent)
+    assert run_over_cultures(replace(study, policies=study.policies + 1), tmp_path).failed == {}
 
 
 def test_cultures_go_on_side_by_side_one_for_each_worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

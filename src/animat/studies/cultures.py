@@ -29,7 +29,7 @@ from animat.report.results import ComparedReturns, OverCultures, Results, Score
 from animat.report.returns import draw_over_cultures
 from animat.report.style import save_formats
 from animat.studies.arms import arm_differences, arms_table, summarise_arms
-from animat.studies.folder import REPORT, RESULTS
+from animat.studies.folder import REPORT, RESULTS, expect_same_specification
 from animat.studies.results import read_typed, write_of_cultures, write_parquet, write_records
 from animat.studies.run import StudyRun, run_study
 from animat.studies.source import read_seeds
@@ -90,6 +90,8 @@ def run_over_cultures(
         raise InvalidArgument("culture: expected many, by seeds or folders, got a single one; run_study runs its study")
     # Checked first, so that a folder with other work is not touched.
     expect_no_other(folder, "cultures")
+    for name, each in studies.items():
+        expect_same_specification(each, folder / name)
     with exclusive_lock(folder):
         _write_manifest(folder, studies, {})
         with _choose_executor(workers, executor) as (shared, at_once):

@@ -22,7 +22,7 @@ from animat.studies.specification import Arm, RobotSpec, Study
 from animat.training.folder import versions_of
 from animat.writing import clear_away, exclusive_lock, is_unfinished, write_whole
 
-MANIFEST = "study.json"
+MANIFEST, SPECIFICATION = "study.json", "study.toml"
 RECORDINGS = "recordings"
 TIMELINE = "simulators/timeline.safetensors"
 RESPONSES = "simulators/responses.csv"
@@ -122,13 +122,27 @@ def _is_claimed(folder: Path, what: str, manifest: dict[str, Any], files: list[s
         return False
     if found["fingerprint"] == manifest["fingerprint"]:
         return all((folder / name).exists() for name in files)
-    # Work that stopped at its first step left only these files, and may be replaced.
+    _expect_replaceable(folder, what, found, manifest, files)
+    return False
+
+
+def _expect_replaceable(
+    folder: Path, what: str, found: dict[str, Any], manifest: dict[str, Any], files: list[str]
+) -> None:
+    """Refuse the folder of other work, unless that stopped at its first step: it then left only these files."""
     left = (path for path in folder.rglob("*") if not path.is_dir() and not path.name.startswith("."))
     if any(path.name not in files and path.parent.name != NOTICES for path in left):
         # What its specification states, by the names that it has there.
         difference = first_difference(found, manifest, ignoring=("fingerprint",), first=("study",))
         raise folder_mismatch(folder, what, difference)
-    return False
+
+
+def expect_same_specification(study: Study, folder: Path) -> None:
+    """Refuse the folder of a study with another specification (Mismatch), without touching it."""
+    found = read_description(folder / MANIFEST, "study")
+    described = json.loads(json.dumps(asdict(study)))
+    if found is not None and found.get("study") != described:
+        _expect_replaceable(folder, "study", found, found | {"study": described}, [MANIFEST, SPECIFICATION])
 
 
 def policies_folder(folder: Path, spec: RobotSpec, arm: Arm) -> Path:

@@ -19,11 +19,19 @@ from animat.execution.jobs import Job, Jobs, expect_workers
 from animat.execution.task import UNFINISHED
 from animat.progress import Progress, Silent
 from animat.robots.checking import check_robot
-from animat.studies.folder import MANIFEST, RECEIPTS, REPORT, claim_folder, describe_study, hash_files, source_files
+from animat.studies.folder import (
+    MANIFEST,
+    RECEIPTS,
+    REPORT,
+    SPECIFICATION,
+    claim_folder,
+    describe_study,
+    hash_files,
+    source_files,
+)
 from animat.studies.specification import Arm, RobotSpec, Study
 from animat.studies.toml import study_to_toml
 
-SPECIFICATION = "study.toml"
 ITERATIONS_PER_S = 110_000
 """Training speed on one core, all policies of a group together; used only to order jobs and estimate the time left."""
 _S_PER_MIN = 0.75
