@@ -23,6 +23,7 @@ from scipy.stats import mannwhitneyu, ttest_1samp
 from animat.cli import main
 from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch, UnusableData
 from animat.evaluation.statistics import compare, interval_of_mean
+from animat.recordings.findings import Finding
 from animat.report.results import ComparedReturns, Results, Score
 from animat.studies import cultures
 from animat.studies.cultures import (
@@ -188,6 +189,26 @@ def test_a_culture_that_fails_is_reported_and_stops_no_other(tmp_path: Path, mon
     assert (tmp_path / cultures.MANIFEST).read_bytes() == before
 
 
+def test_warnings_of_every_culture_are_printed_and_counted_on_the_page(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def ran(study: Study, folder: Path, **_: Any) -> StudyRun:
+        ran = run_with_results(study, folder)
+        worse = Finding("drift", "warning", "at 0 min: responses fall", -0.5 * float(study.culture.seed or 0))
+        found = (worse, Finding("bursts", "note", "few"), *[Finding("optimum", "warning", "differs")] * 2)
+        write_typed(folder / RESULTS, Results((), (), (), (), (), found if study.culture.seed != 3 else ()))
+        return ran
+
+    monkeypatch.setattr(cultures, "run_study", ran)
+    (tmp_path / "many.toml").write_text(study_to_toml(replace(read_study(TINY), culture=Source(seeds="1-3"))))
+    assert main(["study", str(tmp_path / "many.toml"), "--out", str(tmp_path / "out")]) == 0
+    err = capsys.readouterr().err
+    assert "warning: drift: culture-2: at 0 min: responses fall (and 1 more like it)" in err
+    assert "warning: optimum: culture-1: differs (and 3 more like it)" in err and "bursts" not in err
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "culture-2/report.html</a>, 3 warnings</dd>" in page and "culture-3/report.html</a></dd>" in page
+
+
 def run_with_results(study: Study, folder: Path) -> StudyRun:
     (folder / RESULTS).parent.mkdir(parents=True, exist_ok=True)
     rows = (compared(0.0, float(study.culture.seed or 0), SECOND),)
@@ -207,7 +228,9 @@ def test_another_study_is_refused_before_it_touches_the_folder(tmp_path: Path, m
     study = replace(read_study(TINY), culture=Source(seeds="1-2"))
     run_over_cultures(study, tmp_path)
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
-    with pytest.raises(Mismatch, match=r"culture-1: expected a folder of this study, got one of another \(study.policies"):
+    with pytest.raises(
+        Mismatch, match=r"culture-1: expected a folder of this study, got one of another \(study.policies"
+    ):
         run_over_cultures(replace(study, policies=study.policies + 1), tmp_path)
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
     assert list(run_over_cultures(replace(study, culture=Source(seeds="1-3")), tmp_path).finished)[-1] == "culture-3"

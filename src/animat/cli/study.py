@@ -91,6 +91,7 @@ def _run_many(study: Study, base: Path, command: JobOptions) -> dict[str, Any]:
     if cells:
         head = "", "first", "second", "difference", "95 % interval", "second mean larger in", "significantly better in"
         print("\n".join(align_columns(head, cells)))
+    print_warnings(results.findings)
     jobs = sum(len(each.done_now) for each in results.finished.values())
     done = f"{counted(len(results.finished), 'culture')}, {counted(jobs, 'job')}"
     print(f"{done} in {time.monotonic() - began:.0f} s; report: {report}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import threading
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
@@ -24,6 +25,7 @@ from animat.execution.pinned import PinnedProcesses
 from animat.folders import expect_no_other
 from animat.process import own_cores
 from animat.progress import Progress, Silent
+from animat.recordings.findings import Finding
 from animat.report.html import Columns, Section, cell, columns_of, picture_of, table_of, write_page
 from animat.report.results import ComparedReturns, OverCultures, Results, Score
 from animat.report.returns import draw_over_cultures
@@ -46,7 +48,10 @@ MANIFEST = "cultures.json"
 
 @dataclass(frozen=True)
 class CulturesRun:
-    """Results of each finished culture, errors of the others, and a summary; `parquet`: None without fastparquet."""
+    """Results of each finished culture, errors of the others, and a summary; `parquet`: None without fastparquet.
+
+    `findings` are the warnings of the finished cultures; each begins with the name of its culture.
+    """
 
     folder: Path
     finished: dict[str, StudyRun]
@@ -54,6 +59,7 @@ class CulturesRun:
     comparisons: dict[str, tuple[ComparedReturns, ...]]
     summary: tuple[OverCultures, ...]
     parquet: Path | None
+    findings: tuple[Finding, ...] = ()
 
 
 def studies_of(study: Study) -> dict[str, Study]:
@@ -112,7 +118,13 @@ def run_over_cultures(
         write_records(folder / SUMMARY, OverCultures, summary)
         write_of_cultures(folder / SCORES, Score, scores)
         parquet = write_parquet((folder / SCORES).with_suffix(".parquet"), Score, scores)
-    return CulturesRun(folder, finished, failed, comparisons, summary, parquet)
+    findings = tuple(
+        replace(finding, message=f"{name}: {finding.message}")
+        for name, each in results.items()
+        for finding in each.findings
+        if finding.severity != "note"
+    )
+    return CulturesRun(folder, finished, failed, comparisons, summary, parquet, findings)
 
 
 def _write_manifest(folder: Path, names: Iterable[str], failed: Mapping[str, str]) -> None:
@@ -204,7 +216,11 @@ def write_cultures_page(study: Study, found: CulturesRun) -> Path:
         save_formats(figure, found.folder, "over-cultures")
         sections.append(_summary(study, found))
     pages = {name: f"{name}/{REPORT}" for name in found.finished}
-    points = [(name, f"finished: {page}") for name, page in pages.items()]
+    warned = Counter(finding.message.partition(":")[0] for finding in found.findings)
+    points = [
+        (name, f"finished: {page}" + (f", {counted(warned[name], 'warning')}" if warned[name] else ""))
+        for name, page in pages.items()
+    ]
     points += [(name, f"failed: {why}") for name, why in found.failed.items()]
     sections.append(Section("Each culture", points=tuple(points), links=tuple(pages.values())))
     cultures = counted(len(found.finished), "culture") + (f", {len(found.failed)} more failed" if found.failed else "")
