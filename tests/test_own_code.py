@@ -131,12 +131,13 @@ def rover(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     [
         ("# Ends far away.", "# Ends.", True),
         ('"""Moves by the command."""', '"""Moves."""', True),
-        ("return 1", "return 2", True),
+        ("return 1", "return 2", False),
         ("    def observe(self, state):", '    def observe(self, state):\n        """New."""', True),
         ("SIGN = 7", "SIGN = 8", True),
         ("Rover.friction = 0.5", "Rover.friction = 0.6", False),
         ("GAINS.append(2.0)", "GAINS.append(3.0)", False),
-        ("OTHER = 2.0", "OTHER = 3.0", True),
+        ("OTHER = 2.0", "OTHER = 3.0", False),
+        ("OTHER = 2.0\n", "OTHER  =  2.00  # Twice.\n\n\n", True),
         ("SIGN = 1.0", "SIGN = -1.0", False),
         ("return SIGN * jnp.abs(x_m)", "return SIGN * x_m", False),
         ("0.1 * u", "0.2 * u", False),
@@ -144,7 +145,7 @@ def rover(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
         ("import jax.numpy as jnp", "import numpy as jnp", False),
     ],
 )
-def test_what_a_robot_uses_counts_and_nothing_else(rover: Any, old: str, new: str, is_same: bool) -> None:
+def test_all_code_of_its_module_counts_and_no_text(rover: Any, old: str, new: str, is_same: bool) -> None:
     before = code_of(rover())
     assert list(before) == ["code of rover-in-a-file"]
     assert (code_of(rover(old, new)) == before) == is_same

@@ -110,7 +110,7 @@ class GymnasiumRobot(HostRobot):
         packages = known.get(entry.partition(".")[0].partition(":")[0], ())
         names = ["gymnasium", *known.get(engine, ()), *packages]
         module, _, place = entry.partition(":")
-        own = {} if packages else code_at(module, place, self.name)
+        own = code_at(module, self.name) if place and not packages else {}
         return {name: importlib.metadata.version(name) for name in dict.fromkeys(names)} | own
 
     def body(self, *, with_pictures: bool = False) -> Body:
