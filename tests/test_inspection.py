@@ -468,11 +468,11 @@ def test_the_users_settings_of_matplotlib_do_not_change_a_commands_figures(tmp_p
     (tmp_path / "matplotlib").mkdir()
     (tmp_path / "matplotlib/matplotlibrc").write_text("text.usetex: True\nlines.linewidth: 9\nfont.size: 30\n")
     np.savez(tmp_path / "a.npz", spike_time_s=[0.5, 2.5], spike_channel=[0, 1], stimulus_time_s=[])
-    command = [sys.executable, "-m", "animat", "inspect", "a.npz", "--format", "svg", "--out"]
+    command = [sys.executable, "-m", "animat", "inspect", "a.npz", "--out"]
     for out, settings in (("with", {"XDG_CONFIG_HOME": str(tmp_path), "MPLBACKEND": "Qt4Agg"}), ("without", {})):
         done = subprocess.run([*command, out], cwd=tmp_path, env=os.environ | settings, capture_output=True, text=True)
         assert done.returncode == 1 and "no-stimuli" in done.stdout, done.stderr
-    figures = [(tmp_path / out / "a-raster.svg").read_bytes() for out in ("with", "without")]
+    figures = [(tmp_path / out / "a-raster.png").read_bytes() for out in ("with", "without")]
     assert figures[0] == figures[1]
 
 

@@ -251,13 +251,6 @@ def print_warnings(findings: Sequence[Finding]) -> None:
         print(f"warning: {message}", file=sys.stderr)
 
 
-def figure_format(given: str | None, out: Path | None) -> Any:
-    """The format of the figures; raises InvalidArgument for one without a folder, as no figures are drawn then."""
-    if given is not None and out is None:
-        raise InvalidArgument(f"--format: expected only with --out, as no figures are drawn, got {given}")
-    return given or "png"
-
-
 def robot_for(name: str, goal: str | None = None, /, **parameters: float) -> Robot[Any]:
     """A robot by its name, checked if it is not one of ours, with a goal in place of its own task if one is given."""
     from animat.goals.robot import with_goal

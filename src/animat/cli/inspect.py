@@ -6,11 +6,11 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 from tyro.conf import Positional
 
-from animat.cli.command import ResponseOptions, figure_format, print_warnings
+from animat.cli.command import ResponseOptions, print_warnings
 from animat.errors import AnimatError, InvalidArgument, Mismatch, UnusableData, in_min, within
 from animat.progress import Bar, Part, Progress
 from animat.writing import expect_writable
@@ -38,8 +38,6 @@ class Inspect(ResponseOptions):
     training"""
     out: Path | None = None
     """Folder for figures; default: none are drawn"""
-    format: Literal["png", "svg", "pdf"] | None = None
-    """Format of the figures; default: png"""
 
     def run(self) -> dict[str, Any]:
         from animat.recordings.placing import placed_by_date
@@ -51,7 +49,6 @@ class Inspect(ResponseOptions):
         from animat.robots.grid import grid_for
         from animat.robots.registry import robot_named
 
-        drawn_as = figure_format(self.format, self.out)
         if self.optimum is not None:
             try:
                 grid_for(robot_named(self.optimum))
@@ -84,7 +81,7 @@ class Inspect(ResponseOptions):
                     unreadable.append(str(file))
                     continue
                 one = Part(progress, steps * number, steps, total)
-                inspected.append(self._show(source, inspection, drawn_as, one))
+                inspected.append(self._show(source, inspection, one))
                 series.append((file, inspection.responses))
             unusable = [each["name"] for each in inspected if each["verdict"] == "not usable"]
             results: dict[str, Any] = {"recordings": inspected, "unreadable": unreadable, "unusable": unusable}
@@ -108,9 +105,7 @@ class Inspect(ResponseOptions):
         with within(file, (UnusableData, Mismatch)):
             return source, inspect_recording(source, by, window_ms, self.burst_threshold, file.name)
 
-    def _show(
-        self, source: Recording | ResponseTable, inspection: Inspection, drawn_as: Any, progress: Progress
-    ) -> dict[str, Any]:
+    def _show(self, source: Recording | ResponseTable, inspection: Inspection, progress: Progress) -> dict[str, Any]:
         """Print what was found in a file, and draw its figures; returns it for JSON."""
         from animat.report.inspection import draw_inspection, inspection_text
 
@@ -122,7 +117,7 @@ class Inspect(ResponseOptions):
             found["optima"] = _optima(self.optimum, inspection.responses, part)
         if self.out is not None:
             progress.update(1, 2, f"{inspection.name}, figures")
-            figures = [str(figure) for figure in draw_inspection(source, inspection, self.out, drawn_as)]
+            figures = [str(figure) for figure in draw_inspection(source, inspection, self.out)]
             print(f"figures: {', '.join(figures)}\n")
             found["figures"] = figures
         return found
@@ -137,7 +132,7 @@ class Inspect(ResponseOptions):
         first = read_source(file, stimuli=self.stimuli, part=self.part)
         recording = first if isinstance(first, Recording) else None
         try:
-            drawn = draw_series(recording, series, out, figure_format(self.format, out))
+            drawn = draw_series(recording, series, out)
         except Mismatch as unlike:
             print(f"no figures of the series: {unlike}")
             return {}

@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from tyro.conf import Positional
 
-from animat.cli.command import ResponseOptions, figure_format, print_warnings
+from animat.cli.command import ResponseOptions, print_warnings
 from animat.errors import Mismatch, UnusableData, expect_at_least, within
 from animat.writing import expect_writable
 
@@ -27,8 +27,6 @@ class Validate(ResponseOptions):
     """Findings to allow, by name, such as dead-window"""
     out: Path | None = None
     """Folder for a figure of each recording; default: none is drawn"""
-    format: Literal["png", "svg", "pdf"] | None = None
-    """Format of the figures; default: png"""
     seed: int = 1
     """Decides every random draw"""
 
@@ -45,7 +43,6 @@ class Validate(ResponseOptions):
         from animat.responses.readouts import read_readouts
 
         expect_at_least("--seed", self.seed, 0)
-        drawn_as = figure_format(self.format, self.out)
         by = None if self.conditions is None else conditions_named(self.conditions)
         readouts = read_readouts(self.readouts)
         files = list_recordings(self.recordings)
@@ -77,7 +74,7 @@ class Validate(ResponseOptions):
                     print(validation_text(name, validation), end="\n\n")
                     validated.append({"name": name, **validation.to_dict()})
                     if self.out is not None:
-                        figure = save_figure(draw_validation(name, validation), self.out / f"{stem}.{drawn_as}")
+                        figure = save_figure(draw_validation(name, validation), self.out / f"{stem}.png")
                         print(f"figure: {figure}\n")
                         validated[-1]["figure"] = str(figure)
                 if has_several:
