@@ -358,7 +358,6 @@ def test_a_step_back_and_a_look_ahead_are_weighted_means_of_cubic_polynomials(le
     pairs = np.array([[[0, 0], [1, 1], [2, 0], [0, 1]], [[1, 0], [0, 1], [2, 0], [2, 1]]], np.int32)
     weights = rng.dirichlet(np.ones(4), (2, 3)).astype(np.float32)
     weights[1, :, 3] = 0
-    costs = rng.uniform(0, 0.3, (2, 3)).astype(np.float32)
 
     of_axes = [(each[..., None].astype(float) ** four) @ TO_CUBIC for each in (row_places, places)]
     around = values[(rows[..., None] + offsets)[:, :, None, :, None], :, np.maximum(nodes, 0)[..., None, None] + four]
@@ -367,12 +366,12 @@ def test_a_step_back_and_a_look_ahead_are_weighted_means_of_cubic_polynomials(le
     reached[nodes < 0] = 0
     reached[nodes == -2] = places[nodes == -2][:, None] if left else 0
     gained = (rewards[..., None] + reached)[pairs[..., 0], :, :, pairs[..., 1]]
-    worth = np.einsum("lao,lorn->rlna", weights, gained) - costs[:, None]
+    worth = np.einsum("lao,lorn->rlna", weights, gained)
     wanted = worth.max(axis=-1)
 
     landings, best, ends = (rows, row_places, nodes, places, rewards), np.empty_like(values), (0.5, 2.0)
     led_to, bounds = (offsets, pairs, weights), map(np.float32, ends)
-    bellman_backup(values.reshape(-1), *landings, *led_to, costs, left, *bounds, best.reshape(-1))
+    bellman_backup(values.reshape(-1), *landings, *led_to, left, *bounds, best.reshape(-1))
     assert wanted.min() < ends[0] and wanted.max() > ends[1]
     np.testing.assert_allclose(best, np.clip(wanted, *ends), atol=1e-5)
     chosen = np.zeros(30, np.int32)
@@ -381,7 +380,7 @@ def test_a_step_back_and_a_look_ahead_are_weighted_means_of_cubic_polynomials(le
         # As arrays of JAX are.
         for each in there:
             each.setflags(write=False)
-        of_layer = np.full(30, layer, np.int32), pairs, weights, costs[layer]
+        of_layer = np.full(30, layer, np.int32), pairs, weights
         look_ahead(values, *there, offsets, *of_layer, left, chosen)
         np.testing.assert_array_equal(chosen, worth[:, layer, node].argmax(axis=-1))
 

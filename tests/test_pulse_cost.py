@@ -1,4 +1,4 @@
-"""A cost of pulses: what is counted, what is learned, what is best, and what the tables say of it."""
+"""A cost of pulses: what is counted, what is learned, and what the tables say of it."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from animat.coding.mapping import Thresholds
 from animat.cultures.observed import Observed
 from animat.environment import Animat, Environment
 from animat.errors import InvalidArgument, InvalidFile, Mismatch, UnusableData
-from animat.evaluation.optimum import best_return, best_returns
+from animat.evaluation.optimum import best_return
 from animat.evaluation.rollouts import Constant, roll_out
 from animat.evaluation.table import evaluate
 from animat.live.plan import Timetable, check_plan
@@ -128,27 +128,9 @@ def test_costs_of_a_shuffled_delivery_are_those_of_what_is_delivered() -> None:
         TrialCosts(Animat(Stairs(), Thresholds(1), 2), (1.0,))
 
 
-# --- what is best -----------------------------------------------------------------------------------------------------
-
-
-# By default both sides of 9/65, where the first action changes, and one of 0.3, where the second does.
-@pytest.mark.parametrize(
-    "cost", [0.13, 0.15, 0.31, *(pytest.param(cost, marks=pytest.mark.oracle) for cost in (0.0, 0.1, 0.25, 0.29, 0.5))]
-)
-def test_short_games_with_a_cost_by_hand(cost: float) -> None:
-    """Two steps up are 1; the better coin (0.6) costs, the other one (0.3) does not."""
-    one_step_up = max(0.6 - cost, 0.3)
-    truth = max(0.6 * one_step_up - cost, 0.3 * one_step_up)
-    environment = TrialCosts(Animat(Stairs(2), Thresholds(1), 2), (0.0, cost))
-    found = best_return(environment, coins(3, 6), grid=STEPS, episodes=4000)
-    assert found.value == pytest.approx(truth, abs=1e-5)
-    assert abs(found.monte_carlo - truth) < 4 * found.standard_error + 1e-6
-
-
-def test_where_the_best_action_flips() -> None:
-    """A command of 1 or -1 is paid, so many iterations: 0.8 on average, or -0.8 for nothing; they part by 1.6."""
-    paid = [_flat_value(cost) for cost in (0.0, 1.5, 1.6, 1.7, 100.0)]
-    np.testing.assert_allclose(paid, [20 * max(0.8 - cost, -0.8) for cost in (0.0, 1.5, 1.6, 1.7, 100.0)], rtol=1e-5)
+def test_the_optimum_of_a_task_with_a_cost_is_refused() -> None:
+    with pytest.raises(InvalidArgument, match="got TrialCosts, whose optimal return is not known"):
+        best_return(TrialCosts(Animat(Stairs(), Thresholds(1), 2), (0.0, 1.0)), coins(3, 6), grid=STEPS)
 
 
 @dataclass(frozen=True)
@@ -160,29 +142,6 @@ class Flat(Stairs):
 
     def advance(self, uniforms: Any, state: Any, u: Any) -> tuple[Any, Any, Any]:
         return state, u, jnp.bool_(False)
-
-
-def _flat_value(cost: float) -> float:
-    environment = TrialCosts(Animat(Flat(), Thresholds(1), 2), (0.0, cost))
-    return best_return(environment, coins(1, 9), grid=STEPS, episodes=0).value
-
-
-def test_cases_with_and_without_a_cost_side_by_side_are_as_alone() -> None:
-    plain, shuffled = Animat(Flat(), Thresholds(1), 2), ShuffledDelivery(Animat(Flat(), Thresholds(1), 2))
-    cases = [
-        (plain, coins(1, 9)),
-        (TrialCosts(plain, (0.0, 0.5)), coins(1, 9)),
-        (TrialCosts(shuffled, (0.0, 0.5)), coins(1, 9)),
-        (TrialCosts(Animat(Flat(), Thresholds(1), 3), (0.0, 9.0, 1.0)), coins(1, 9, 8)),
-    ]
-    values = [each.value for each in best_returns(cases, grid=STEPS, episodes=0)]
-    np.testing.assert_allclose(values, [20 * 0.8, 20 * 0.3, -20 * 0.25, 20 * max(-0.8, 0.6 - 1.0)], rtol=1e-5)
-    # The same to the last bit where nothing costs anything.
-    inside_others = [NeuralObservation(TrialCosts(plain, (0.0, 0.5))), ShuffledDelivery(TrialCosts(plain, (0.0, 0.5)))]
-    nested = best_returns([(each, coins(1, 9)) for each in inside_others], grid=STEPS, episodes=0)
-    assert [each.value for each in nested] == values[1:3]
-    free = best_return(TrialCosts(plain, (0.0, 0.0)), coins(1, 9), grid=STEPS, episodes=500)
-    assert free == best_return(plain, coins(1, 9), grid=STEPS, episodes=500)
 
 
 # --- what is learned --------------------------------------------------------------------------------------------------
@@ -344,12 +303,9 @@ def test_an_evaluation_counts_what_each_agent_gives(responses: Responses) -> Non
         presented = row.episodes.presented @ np.array(COUNTS)
         assert data["electrode_pulses"] * 40 * len(presented) == pytest.approx(presented.sum()) or row.name == "silent"
         assert data["net_return"] == data["mean_return"] - 0.3 * data["electrode_pulses"]
-    assert table.net_optimum is not None and table.optimum is not None
-    assert table.net_optimum.value <= table.optimum.value + 1e-6
-    assert max(row.to_dict()["net_return"] or 0 for row in rows.values()) <= table.net_optimum.value + 0.5
+    assert table.optimum is not None
     text = table.to_text()
     assert "electrode pulses  net return" in text and "net return: mean return - 0.3 x electrode pulses" in text
-    assert "with the cost of pulses: optimal return" in text
     json.dumps(table.to_dict())
     # Without a cost the pulses are there, and no net return; where electrodes are not known, neither.
     free = evaluate({"p": policy_of(0, responses, pulse_cost=0.0)}, fit_timeline([responses]), episodes=5)

@@ -16,7 +16,7 @@ from jaxtyping import Float, Float32, Float64, Int32, UInt16
 from animat.arguments import checked_arguments
 from animat.environment import Animat, Environment, Neurons, WithoutNeurons
 from animat.errors import InvalidArgument, Mismatch
-from animat.evaluation.commands import CLASSES, class_of, commands_after, is_shuffled, memory_of, nodes_for
+from animat.evaluation.commands import CLASSES, class_of, commands_after, memory_of, nodes_for
 from animat.evaluation.landings import Motion, Outcomes, side_by_side
 from animat.evaluation.statistics import Interval, standard_error
 from animat.evaluation.sweeping import bellman_backup, cubic, fill_row_weights, look_ahead
@@ -25,7 +25,7 @@ from animat.progress import Part, Progress, Silent
 from animat.recordings.findings import Finding
 from animat.robots.grid import Grid, grid_of_optimum
 from animat.robots.starts import Starts
-from animat.wrappers import EpisodeLimit, NeuralObservation, ShuffledDelivery, TrialCosts, net_reward, unwrapped
+from animat.wrappers import EpisodeLimit, NeuralObservation, ShuffledDelivery
 
 Case = tuple[Environment[Any], Neurons]
 """An environment, and the simulator in it (None without neurons)."""
@@ -139,11 +139,11 @@ def best_returns(
 
         V_0 = 0,    V_n(s) = max_a E[r + (1 - end) V_(n-1)(s') | s, a],    value = V_limit(start)
 
-    with the expectation over the command that action a leads to (`commands_of`) and over the robot's noise. If trials
-    have a cost (`animat.wrappers.TrialCosts`), r is the reward less the cost of a. With memory, s also contains the
-    class of the history (`commands_after`). V is stored at the nodes of a grid and interpolated by cubic polynomials
-    along each axis, so the value is an approximation; `grid_error` shows how good. The controller that takes the
-    maximising action, run on the environment, gives an achievable return: it exceeds the true optimum only by chance.
+    with the expectation over the command that action a leads to (`commands_of`) and over the robot's noise. With
+    memory, s also contains the class of the history (`commands_after`). V is stored at the nodes of a grid and
+    interpolated by cubic polynomials along each axis, so the value is an approximation; `grid_error` shows how good.
+    The controller that takes the maximising action, run on the environment, gives an achievable return: it exceeds the
+    true optimum only by chance.
 
     Args:
         cases: environments, all of the same robot, each with its simulator (None without neurons).
@@ -208,7 +208,7 @@ def optimal_values(
 def _expect_known(environment: Environment[Any]) -> None:
     """Refuse an environment that may change what dynamic programming computes from the robot's own steps."""
     inmost = environment
-    while isinstance(inmost, EpisodeLimit | NeuralObservation | ShuffledDelivery | TrialCosts):
+    while isinstance(inmost, EpisodeLimit | NeuralObservation | ShuffledDelivery):
         inmost = inmost.inside
     kind, kinds = type(inmost), (Animat, WithoutNeurons)
     if (kind.respond, kind.advance) not in [(known.respond, known.advance) for known in kinds]:
@@ -221,15 +221,6 @@ def _expect_known(environment: Environment[Any]) -> None:
 def _step(environment: Environment[Any], episodes: int, key: Any, state: Any, action: Any, simulator: Any) -> Any:
     uniforms = jax.random.uniform(key, (episodes, environment.noise_size), np.float32)
     return jax.vmap(environment.advance, (0, 0, 0, None))(uniforms, state, action, simulator)
-
-
-def _costs_of(environment: Environment[Any], n_actions: int) -> Float32[np.ndarray, " actions"]:
-    """The cost of each action's trial; with shuffled delivery, their mean."""
-    costing = unwrapped(environment, TrialCosts)
-    if not isinstance(costing, TrialCosts):
-        return np.zeros(n_actions, np.float32)
-    costs = np.array(costing.costs, np.float32)
-    return np.full(n_actions, costs.mean()) if is_shuffled(environment) else costs
 
 
 class _Tables:
@@ -278,7 +269,6 @@ class _Programme:
         ends = np.cumsum([len(of_case) for of_case in after]).tolist()
         self._layers = [slice(end - len(of_case), end) for end, of_case in zip(ends, after, strict=True)]
         self.n_layers = ends[-1]
-        self._costs = [_costs_of(environment, len(a)) for (environment, _), a in zip(cases, self._actions, strict=True)]
         self._motion = Motion(robot, grid, nodes, uniforms)
         self.bounds = -math.inf, math.inf
 
@@ -289,19 +279,14 @@ class _Programme:
         grid = self._grid
         landings = self._motion.from_grid()
         pairs, weights = side_by_side(self._outcomes)
-        # A case with fewer actions is padded with its last one.
-        costs = [np.pad(of_case, (0, weights.shape[1] - len(of_case)), mode="edge") for of_case in self._costs]
-        costs_of_layers = np.repeat(costs, [len(each.weights) for each in self._outcomes], axis=0)
-        dearest = float(np.max(costs_of_layers))
         values = np.zeros((grid.n_rows, self.n_layers, grid.along.stored), np.float32)
         before = np.empty_like(values)
         for remaining, (lowest, highest) in zip(range(self._robot.episode_limit), landings.bounds(), strict=False):
-            lowest -= dearest * (remaining + 1)
             self.bounds = lowest, highest
             if tables is not None:
                 tables.keep(remaining, values)
             ends = np.float32(lowest), np.float32(highest)
-            led_to = grid.row_offsets, pairs, weights, costs_of_layers
+            led_to = grid.row_offsets, pairs, weights
             bellman_backup(values.reshape(-1), *landings, *led_to, remaining, *ends, before.reshape(-1))
             values, before = before, values
             progress.update(remaining + 1, self._robot.episode_limit)
@@ -329,10 +314,10 @@ class _Programme:
             rows, row_places, *along = self._motion.from_states(state.robot)
             landings = rows, row_places, *(each[:, :, 0] for each in along)
             values, layers = tables.values(remaining, self._layers[case]), self._layer_at(case, state.neurons)
-            led_to = layers, pairs, outcomes.weights, self._costs[case]
+            led_to = layers, pairs, outcomes.weights
             look_ahead(values, *landings, self._grid.row_offsets, *led_to, remaining, chosen)
-            before, state = state, _step(environment, episodes, key, state, actions[chosen], simulator)
-            returns += np.where(going, np.asarray(net_reward(before, state), np.float64), 0.0)
+            state = _step(environment, episodes, key, state, actions[chosen], simulator)
+            returns += np.where(going, np.asarray(state.reward, np.float64), 0.0)
             going &= ~np.asarray(state.ended.terminated)
             if not going.any():
                 break

@@ -36,7 +36,6 @@ class Evaluation:
         fixed_from_min: time of the recording whose percentiles the mapping keeps; None if it uses the simulator's.
         objectives: of the robot's goal, as texts; empty for a robot without one.
         whose_work: what the policies lose with each intervention; None if it was not requested.
-        net_optimum: the optimal return of any controller less the cost of pulses, if they have a cost.
         seed: of all random draws.
         greedy: whether policies took their most probable actions, or drew them as in training.
         versions: of what may round or draw differently.
@@ -56,7 +55,6 @@ class Evaluation:
     context: ContextGap | None = None
     objectives: tuple[str, ...] = ()
     whose_work: InterventionTable | None = None
-    net_optimum: Optimum | None = None
     seed: int = 1
     greedy: bool = True
     versions: Mapping[str, str] = field(default_factory=dict)
@@ -114,7 +112,6 @@ class Evaluation:
             "optimum": None if self.optimum is None else self.optimum.to_dict(),
             "no_optimum": self.no_optimum,
             "pulse_cost": self.rows[0].pulse_cost,
-            "net_optimum": None if self.net_optimum is None else self.net_optimum.to_dict(),
             "context": None if self.context is None else self.context.to_dict(),
             "context_score": None if self.context_score is None else self.context_score.to_dict(),
             "whose_work": None if self.whose_work is None else self.whose_work.to_dict(),
@@ -185,6 +182,4 @@ class Evaluation:
             if changed := [row.name for row in self.rows if row.changed]:
                 meaning += f"; none for {' and '.join(changed)}, whose optimum is different"
         lines = [f"  {self.optimum.to_text()}", f"  {meaning}"]
-        if self.net_optimum is not None:
-            lines.append(f"  with the cost of pulses: {self.net_optimum.to_text()}")
         return [*lines, *context]

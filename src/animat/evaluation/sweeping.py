@@ -53,7 +53,6 @@ def bellman_backup(
     row_offsets: Int32[np.ndarray, " taps"],
     outcomes: Int32[np.ndarray, "layers outcomes 2"],
     weights: Float32[np.ndarray, "layers actions outcomes"],
-    costs: Float32[np.ndarray, "layers actions"],
     remaining: int,
     lowest: np.float32,
     highest: np.float32,
@@ -61,7 +60,7 @@ def bellman_backup(
 ) -> None:
     """The value of each state under its best action, given the values of the next states.
 
-        best_l(s) = max_a sum_o weights_l(a, o) (reward_k(s) + value_m(landing_k(s))) - costs_l(a),
+        best_l(s) = max_a sum_o weights_l(a, o) (reward_k(s) + value_m(landing_k(s))),
         (k, m) = outcomes_l(o)
 
     Each case has one layer of values or, with memory, one for each class of the history. The rows around a landing are
@@ -136,7 +135,7 @@ def bellman_backup(
             row_best = best[start : start + n_nodes]
             row_best[:] = f4(-np.inf)
             for action in range(n_actions):
-                worth[:] = -costs[layer, action]
+                worth[:] = f4(0)
                 for outcome in range(n_outcomes):
                     weight = weights[layer, action, outcome]
                     if weight != f4(0):
@@ -162,7 +161,6 @@ def look_ahead(
     layers: Int32[np.ndarray, " states"],
     outcomes: Int32[np.ndarray, "layers outcomes 2"],
     weights: Float32[np.ndarray, "layers actions outcomes"],
-    costs: Float32[np.ndarray, " actions"],
     remaining: int,
     chosen: Int32[np.ndarray, " states"],
 ) -> None:
@@ -190,7 +188,7 @@ def look_ahead(
                     )
         highest = f4(-np.inf)
         for action in range(n_actions):
-            worth = -costs[action]
+            worth = f4(0)
             for outcome in range(n_outcomes):
                 worth += weights[layer, action, outcome] * landed[outcome]
             if worth > highest:

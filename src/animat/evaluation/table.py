@@ -31,7 +31,7 @@ from animat.robots.base import Robot, lacking
 from animat.robots.host import HostRobot
 from animat.training.folder import versions_of
 from animat.training.policy import Policy, first_of_alike
-from animat.wrappers import NeuralObservation, TrialCosts, unwrapped
+from animat.wrappers import NeuralObservation, unwrapped
 
 
 @checked_arguments
@@ -106,21 +106,18 @@ def evaluate(
     for control in acting:
         rows.append(world.row_of(control, episodes=episodes, seed=seed))
         progress.update(len(rows), steps, control.name)
-    optimum, no_optimum, net_optimum = None, None, None
+    optimum, no_optimum = None, None
     if optimum_resolution is not None:
         phase = in_phase(progress, "optimal return")
         try:
             optimum = world.optimum(optimum_resolution, seed, phase)
         except (InvalidArgument, UnusableData) as error:
             no_optimum = str(error)
-        # Conditions with few responses would promise too much.
-        if optimum is not None and not optimum.left_out:
-            net_optimum = world.net_optimum(optimum_resolution, seed)
     work = None
     if interventions:
         phase = in_phase(progress, "whose work it is")
         work = run_interventions(*trained.within(*within), networks, episodes=episodes, seed=seed, progress=phase)
-    findings += _findings_on(optimum, rows) + (() if net_optimum is None else net_optimum.findings())
+    findings += _findings_on(optimum, rows)
     return Evaluation(
         robot=body.name,
         mapping=None if first.mapping is None else first.mapping.name,
@@ -134,7 +131,6 @@ def evaluate(
         context=_context(rows, optimum, body.return_range[1]),
         objectives=objectives_of(body),
         whose_work=work,
-        net_optimum=net_optimum,
         seed=seed,
         greedy=greedy,
         versions=versions_of(("animat", "jax", "jaxlib", "numpy"), [body]),
@@ -221,14 +217,6 @@ class _World:
         alone, resampled = (Part(progress, i, 1, 2, note) for i, note in enumerate(("optimal return", "its interval")))
         best = best_return(case.environment, case.simulator, resolution=resolution, seed=seed, progress=alone)
         return case.with_interval(best, resolution=resolution, seed=seed, progress=resampled)
-
-    def net_optimum(self, resolution: float, seed: int) -> Optimum | None:
-        """The optimal return less the cost of pulses; None if they have no cost."""
-        cost, of_trials = self.first.pulse_cost, self.pulses_of_trials
-        if not cost or of_trials is None:
-            return None
-        costing = TrialCosts(unwrapped(self.environment), tuple(cost * count for count in of_trials))
-        return best_return(costing, self.simulator, resolution=resolution, seed=seed)
 
 
 def _context(rows: Sequence[Row], optimum: Optimum | None, largest_return: float) -> ContextGap | None:
