@@ -185,12 +185,6 @@ class Row:
         """Each actor's mean return over its episodes, which the paper calls a policy's performance."""
         return self.episodes.returns.mean(axis=1)  # type: ignore[no-any-return]
 
-    @property
-    def at_least(self) -> tuple[str, float]:
-        """Its name, and its mean return less three standard errors over episodes."""
-        returns = self.episodes.returns
-        return self.name, float(returns.mean() - 3 * returns.std() / returns.size**0.5)
-
     def to_dict(self) -> dict[str, Any]:
         """The row as plain data; the net return is the mean return less the cost of pulses, if these are known."""
         means = self.mean_returns

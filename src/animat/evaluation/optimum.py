@@ -92,17 +92,12 @@ class Optimum:
         runs = (self.monte_carlo, self.standard_error), (self.without_clock, self.without_clock_standard_error)
         return max((run for run in runs if not math.isnan(run[0])), default=(math.nan, math.nan))
 
-    def findings(self, best: tuple[str, float] | None = None) -> tuple[Finding, ...]:
-        """A warning if the value and its controller's return differ by more than chance and the grid's error.
-
-        `best` is the name of the best other agent, and what it returns at least, if there are others.
-        """
-        return bracket_findings(self.value, self.grid_error, *self.achieved, best)
+    def findings(self) -> tuple[Finding, ...]:
+        """A warning if the value and its controller's return differ by more than chance and the grid's error."""
+        return bracket_findings(self.value, self.grid_error, *self.achieved)
 
 
-def bracket_findings(
-    value: float, grid_error: float, monte_carlo: float, error: float, best: tuple[str, float] | None = None
-) -> tuple[Finding, ...]:
+def bracket_findings(value: float, grid_error: float, monte_carlo: float, error: float) -> tuple[Finding, ...]:
     """A warning if a value and its controller's return differ by more than 3 of its `error` plus the grid's error."""
     difference, of_controller = value - monte_carlo, f"its controller's return {monte_carlo:.2f} +- {error:.2f}"
     # No warning for NaN, where the controller was not run.
@@ -113,8 +108,6 @@ def bracket_findings(
         f"{CLASSES} history classes are; use a higher resolution"
     )
     which = " differ: the optimal return lies between the two" if difference > 0 else too_coarse
-    if difference > 0 and best is not None and monte_carlo < best[1] < value:
-        which = f" differ: the optimal return lies between {best[1]:.2f}, which {best[0]} reaches, and the value"
     message = f"the value {value:.2f} (grid {grid_error:.2f}) and {of_controller}{which}"
     return (Finding("optimum", "warning", message, difference),)
 

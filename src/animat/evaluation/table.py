@@ -117,7 +117,7 @@ def evaluate(
     if interventions:
         phase = in_phase(progress, "whose work it is")
         work = run_interventions(*trained.within(*within), networks, episodes=episodes, seed=seed, progress=phase)
-    findings += _findings_on(optimum, rows)
+    findings += () if optimum is None else optimum.findings()
     return Evaluation(
         robot=body.name,
         mapping=None if first.mapping is None else first.mapping.name,
@@ -153,16 +153,6 @@ def _names_of_controls(wanted: str | Collection[str] | None, known: Sequence[str
     if unknown := sorted({*names} - {*known, "heuristic", "coupling"}):
         raise InvalidArgument(f"controls: expected some of {', '.join(known)}, got {', '.join(unknown)}")
     return names
-
-
-def _findings_on(optimum: Optimum | None, rows: Sequence[Row]) -> tuple[Finding, ...]:
-    """Doubts about the optimum, given what the best of the rows surely reaches."""
-    if optimum is None:
-        return ()
-    # Conditions that the optimum leaves out would not count.
-    reached = [row for row in rows if not row.changed and not optimum.left_out]
-    best = max(reached, key=lambda row: row.mean_returns.mean(), default=None)
-    return optimum.findings(None if best is None else best.at_least)
 
 
 @dataclass(frozen=True, eq=False)
