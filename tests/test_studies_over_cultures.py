@@ -24,7 +24,7 @@ from animat.cli import main
 from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch, UnusableData
 from animat.evaluation.statistics import compare, interval_of_mean
 from animat.recordings.findings import Finding
-from animat.report.results import ComparedReturns, Results, Score
+from animat.report.results import ComparedReturns, HeuristicComparison, Results, Score
 from animat.studies import cultures
 from animat.studies.cultures import (
     CulturesRun,
@@ -34,6 +34,8 @@ from animat.studies.cultures import (
     write_cultures_page,
 )
 from animat.studies.folder import RESULTS, describe_study
+from animat.studies.outperforming import NOT, OUTPERFORM
+from animat.studies.outperforming import TOO_FEW as TOO_FEW_EPISODES
 from animat.studies.results import write_typed
 from animat.studies.run import StudyRun, run_study
 from animat.studies.source import Source, read_seeds
@@ -207,6 +209,31 @@ def test_warnings_of_every_culture_are_printed_and_counted_on_the_page(
     assert "warning: optimum: culture-1: differs (and 3 more like it)" in err and "bursts" not in err
     page = (tmp_path / "out" / "report.html").read_text()
     assert "culture-2/report.html</a>, 3 warnings</dd>" in page and "culture-3/report.html</a></dd>" in page
+
+
+def test_policies_that_do_not_outperform_the_heuristic_are_counted_over_cultures(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    outcomes = {1: (NOT, OUTPERFORM), 2: (OUTPERFORM, OUTPERFORM), 3: (NOT, OUTPERFORM), 4: (TOO_FEW_EPISODES, NOT)}
+
+    def ran(study: Study, folder: Path, **_: Any) -> StudyRun:
+        ran = run_with_results(study, folder)
+        arms = zip(("9 thresholds", "linear"), outcomes[study.culture.seed or 0], strict=True)
+        rows = tuple(HeuristicComparison("cartpole", arm, 10.0, 1.0, 2.0, 0.5, 0.5, outcome) for arm, outcome in arms)
+        write_typed(folder / RESULTS, Results((), (), (), rows, (), ()))
+        return ran
+
+    monkeypatch.setattr(cultures, "run_study", ran)
+    (tmp_path / "many.toml").write_text(study_to_toml(replace(read_study(TINY), culture=Source(seeds="1-4"))))
+    assert main(["study", str(tmp_path / "many.toml"), "--out", str(tmp_path / "out"), "--json"]) == 0
+    of_nine = (
+        "cartpole, 9 thresholds, at 10 min: the policies do not outperform the heuristic policy in 2 of 3 cultures"
+    )
+    of_linear = "cartpole, linear, at 10 min: the policies do not outperform the heuristic policy in 1 of 4 cultures"
+    printed = capsys.readouterr().out.splitlines()
+    assert of_nine in printed and of_linear in printed
+    assert json.loads(printed[-1])["not_outperforming_the_heuristic"] == [of_nine, of_linear]
+    assert f"C{of_nine[1:]}." in (tmp_path / "out" / "report.html").read_text()
 
 
 def run_with_results(study: Study, folder: Path) -> StudyRun:

@@ -91,6 +91,8 @@ def _run_many(study: Study, base: Path, command: JobOptions) -> dict[str, Any]:
     if cells:
         head = "", "first", "second", "difference", "95 % interval", "second mean larger in", "significantly better in"
         print("\n".join(align_columns(head, cells)))
+    for message in results.not_outperforming:
+        print(message)
     print_warnings(results.findings)
     jobs = sum(len(each.done_now) for each in results.finished.values())
     done = f"{counted(len(results.finished), 'culture')}, {counted(jobs, 'job')}"
@@ -107,4 +109,5 @@ def _run_many(study: Study, base: Path, command: JobOptions) -> dict[str, Any]:
         "report": str(report),
         "cultures": list(results.finished),
         "over_cultures": [asdict(row) for row in results.summary],
+        "not_outperforming_the_heuristic": list(results.not_outperforming),
     }

@@ -30,8 +30,9 @@ from animat.report.html import Columns, Section, cell, columns_of, picture_of, t
 from animat.report.results import ComparedReturns, OverCultures, Results, Score
 from animat.report.returns import draw_over_cultures
 from animat.report.style import save_formats
-from animat.studies.arms import arm_differences, arms_table, summarise_arms
+from animat.studies.arms import arm_differences, arms_table, begin, summarise_arms
 from animat.studies.folder import REPORT, RESULTS, expect_same_specification
+from animat.studies.outperforming import not_outperforming_over
 from animat.studies.results import read_typed, write_of_cultures, write_parquet, write_records
 from animat.studies.run import StudyRun, run_study
 from animat.studies.source import read_seeds
@@ -50,7 +51,8 @@ MANIFEST = "cultures.json"
 class CulturesRun:
     """Results of each finished culture, errors of the others, and a summary; `parquet`: None without fastparquet.
 
-    `findings` are the warnings of the finished cultures; each begins with the name of its culture.
+    `findings` are the warnings of the finished cultures; each begins with the name of its culture. `not_outperforming`
+    has a sentence for each arm whose policies do not outperform the heuristic policy in some of them.
     """
 
     folder: Path
@@ -60,6 +62,7 @@ class CulturesRun:
     summary: tuple[OverCultures, ...]
     parquet: Path | None
     findings: tuple[Finding, ...] = ()
+    not_outperforming: tuple[str, ...] = ()
 
 
 def studies_of(study: Study) -> dict[str, Study]:
@@ -124,7 +127,8 @@ def run_over_cultures(
         for finding in each.findings
         if finding.severity != "note"
     )
-    return CulturesRun(folder, finished, failed, comparisons, summary, parquet, findings)
+    heuristic = tuple(not_outperforming_over(results.values()))
+    return CulturesRun(folder, finished, failed, comparisons, summary, parquet, findings, heuristic)
 
 
 def _write_manifest(folder: Path, names: Iterable[str], failed: Mapping[str, str]) -> None:
@@ -215,6 +219,9 @@ def write_cultures_page(study: Study, found: CulturesRun) -> Path:
         figure = draw_over_cultures([*zip(found.summary, differences, strict=True)])
         save_formats(figure, found.folder, "over-cultures")
         sections.append(_summary(study, found))
+    if found.not_outperforming:
+        sentences = tuple(f"{begin(sentence)}." for sentence in found.not_outperforming)
+        sections.append(Section("Against the heuristic policy", sentences))
     pages = {name: f"{name}/{REPORT}" for name in found.finished}
     warned = Counter(finding.message.partition(":")[0] for finding in found.findings)
     points = [

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from itertools import chain
 
+from animat.errors import counted
 from animat.evaluation.coupling import REFLEX_GAP, context_gap
 from animat.evaluation.statistics import Interval, compare_episodes, is_worse
 from animat.report.results import HeuristicComparison, ReflexComparison, Results, StudyOptimum
@@ -39,6 +41,20 @@ def not_outperforming(results: Results) -> list[str]:
         f"{'; they are worse' if is_worse(row.p, row.wins) else ''})"
         for row in results.heuristic
         if row.outcome == NOT
+    ]
+
+
+def not_outperforming_over(cultures: Iterable[Results]) -> list[str]:
+    """The same over cultures: in how many of those that were compared the policies do not outperform it."""
+    outcomes: dict[tuple[str, str, float], list[str]] = {}
+    for row in chain.from_iterable(results.heuristic for results in cultures):
+        if row.outcome != TOO_FEW:
+            outcomes.setdefault((row.robot, row.arm, row.at_min), []).append(row.outcome)
+    return [
+        f"{robot}, {arm}, at {at_min:g} min: the policies do not outperform the heuristic policy in "
+        f"{found.count(NOT)} of {counted(len(found), 'culture')}"
+        for (robot, arm, at_min), found in outcomes.items()
+        if NOT in found
     ]
 
 
