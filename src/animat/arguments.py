@@ -116,8 +116,11 @@ def _unfitting(value: Any, hint: Any) -> list[Any]:
     if issubclass(kind, tuple) and Ellipsis not in inner:
         return [] if isinstance(value, Iterable) else [value]
     if getattr(kind, "_is_protocol", False):
-        is_checkable = getattr(kind, "_is_runtime_protocol", False)
-        fits = isinstance(value, kind) if is_checkable else "__call__" not in vars(kind) or callable(value)
+        if getattr(kind, "_is_runtime_protocol", False):
+            # From Python 3.12 on `isinstance` does not see what `__getattr__` provides.
+            fits = all(hasattr(value, member) for member in vars(kind) if not member.startswith("_"))
+        else:
+            fits = "__call__" not in vars(kind) or callable(value)
     elif inner and issubclass(kind, Mapping):
         if isinstance(value, Mapping):
             pairs = [pair for item in value.items() for pair in zip(item, inner, strict=True)]
