@@ -33,6 +33,8 @@ from animat.tuning.tasks import Fit, TrainTrials, group_by_shape, returns_file, 
 
 MANIFEST = "tune.json"
 FINALS = "finals"
+_COMPILING_S = 10
+"""About how long the program of a job takes to compile, for the time left."""
 
 
 def tune(
@@ -81,8 +83,10 @@ class _Run:
         tune = tuning.tune
         self._first = min(len(first_settings(tuning.study, tuning.space)), tune.trials)
         self._progress, self._done_s = progress, 0.0
-        self._total_s = 20 + self._cost_s(tune.policies * tune.trials, CHUNKS) * 0.4
-        self._total_s += self._cost_s(tuning.study.policies * (tune.finalists + self._first), CHUNKS)
+        batches = -(-tune.trials // tune.together)
+        finals = tune.finalists + self._first
+        self._total_s = 20 + batches * self._batch_s(min(tune.together, tune.trials))
+        self._total_s += self._cost_s(tuning.study.policies * finals, CHUNKS) + _COMPILING_S * finals
 
     def fit(self, base: Path) -> None:
         """Make the recordings, and simulators of every kind in the search."""
@@ -113,7 +117,7 @@ class _Run:
                     f"{first} to {first + len(proposed) - 1}; remove it to run its trials again"
                 )
             else:
-                self._done_s += 0.4 * self._cost_s(tune.policies * len(proposed), CHUNKS)
+                self._done_s += self._batch_s(len(proposed))
             results += batch
             # What its trials learned is not needed any more.
             shutil.rmtree(self._folder / place, ignore_errors=True)
@@ -188,7 +192,8 @@ class _Run:
 
     def _job(self, name: str, task: TrainTrials) -> Job:
         first, last = task.chunks
-        return Job(name, task, (), self._cost_s(len(task.trials) * len(task.members), last - first), task.reads)
+        cost_s = _COMPILING_S + self._cost_s(len(task.trials) * len(task.members), last - first)
+        return Job(name, task, (), cost_s, task.reads)
 
     def _run_jobs(self, jobs: list[Job], receipts: str, cost_s: float, note: str) -> None:
         left = Jobs(jobs, self._folder, self._folder / receipts, self._fingerprint)
@@ -196,6 +201,11 @@ class _Run:
             part = Part(self._progress, self._done_s, cost_s, max(self._total_s, self._done_s + cost_s), note)
             left.run(workers=None, executor=self._executor, progress=part)
         self._done_s += cost_s
+
+    def _batch_s(self, trials: int) -> float:
+        """About how long a batch takes on one core, most of whose trials are stopped early."""
+        tune = self._tuning.tune
+        return 0.4 * self._cost_s(tune.policies * trials, CHUNKS) + _COMPILING_S * len(tune.chunks)
 
     def _cost_s(self, policies: int, chunks: int) -> float:
         return policies * self._tuning.study.robots[0].trained_for * chunks / CHUNKS / ITERATIONS_PER_S
