@@ -18,7 +18,7 @@ from animat.errors import InvalidArgument, Mismatch
 from animat.evaluation.optimal_returns import WellSampled
 from animat.evaluation.optimum import Optimum, best_return
 from animat.evaluation.rollouts import Constant, HeuristicPolicy, Uniform, heuristic_policy, networks_of, roll_out
-from animat.evaluation.table import evaluate
+from animat.evaluation.table import _context, evaluate
 from animat.neurons.simulator import fit_histogram, silenced
 from animat.neurons.synthetic import synthetic_simulator
 from animat.neurons.timeline import SimulatorTimeline, fit_timeline
@@ -326,6 +326,13 @@ def test_the_optimum_scores_what_acts_in_the_same_environment() -> None:
     # Without random actions there is nothing to score against.
     unscored = replace(found, rows=tuple(row for row in found.rows if row.name != "random"))
     assert {row["normalised_score"] for row in unscored.to_dict()["rows"]} == {None}
+
+    # Nor with an optimum that its own controller surpasses.
+    low = replace(found.optimum, value=found.optimum.achieved[0] - 20.0)
+    surpassed = replace(found, optimum=low)
+    assert found.context is not None and _context(surpassed.rows, low, 120.0) is None
+    assert {row["normalised_score"] for row in surpassed.to_dict()["rows"]} == {None}
+    assert "no score, as the optimal return is less than its controller's" in surpassed.to_text()
 
     # Nothing else changes, and the optimum is not reported if it was not requested.
     assert plainly.optimum is None and plainly.no_optimum is None

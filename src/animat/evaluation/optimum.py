@@ -92,6 +92,11 @@ class Optimum:
         runs = (self.monte_carlo, self.standard_error), (self.without_clock, self.without_clock_standard_error)
         return max((run for run in runs if not math.isnan(run[0])), default=(math.nan, math.nan))
 
+    @property
+    def is_surpassed(self) -> bool:
+        """Whether its own controller returns more, beyond chance: then the value is too low to compare returns with."""
+        return any(finding.value is not None and finding.value < 0 for finding in self.findings())
+
     def findings(self) -> tuple[Finding, ...]:
         """A warning if the value and its controller's return differ by more than chance and the grid's error."""
         return bracket_findings(self.value, self.grid_error, *self.achieved)

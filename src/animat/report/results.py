@@ -48,6 +48,11 @@ class StudyOptimum:
         timed, its_error, untimed, error = (math.nan if each is None else each for each in runs)
         return Optimum(self.best_return, self.grid_error, timed, its_error, untimed, error, 0, self.nodes or 0)
 
+    @property
+    def is_for_scores(self) -> bool:
+        """Whether returns can be compared with it: over all conditions, and not surpassed by its own controller."""
+        return self.left_out is None and not (self.known is not None and self.known.is_surpassed)
+
     def findings(self) -> tuple[Finding, ...]:
         """A finding if the value and the better return of its controller differ."""
         return () if self.known is None else self.known.findings()

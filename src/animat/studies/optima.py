@@ -46,9 +46,9 @@ def read_optima(folder: Path, robot: str, what: str = "optima") -> tuple[StudyOp
     return read_typed(optima_file(folder, robot, what), tuple[StudyOptimum, ...])
 
 
-def complete_optima(optima: Iterable[StudyOptimum]) -> dict[tuple[str, str, float], StudyOptimum]:
-    """The optima of one robot over all conditions, by `key_of`; those over fewer do not apply to the policies."""
-    return {key_of(optimum, optimum.at_min): optimum for optimum in optima if optimum.left_out is None}
+def comparable_optima(optima: Iterable[StudyOptimum]) -> dict[tuple[str, str, float], StudyOptimum]:
+    """The optima of one robot that returns can be compared with, by `key_of`."""
+    return {key_of(optimum, optimum.at_min): optimum for optimum in optima if optimum.is_for_scores}
 
 
 def key_of(of: Arm | StudyOptimum, at_min: float) -> tuple[str, str, float]:

@@ -11,7 +11,7 @@ from animat.evaluation.statistics import Interval, compare_episodes, is_worse
 from animat.report.results import HeuristicComparison, ReflexComparison, Results, StudyOptimum
 from animat.studies.episodes import COUPLING, POLICY, RANDOM, DataFrame, mean_returns, rows_where
 from animat.studies.evaluating import is_usual
-from animat.studies.optima import complete_optima, key_of
+from animat.studies.optima import comparable_optima, key_of
 from animat.studies.specification import RobotSpec, Study, mapping_label
 
 HEURISTIC = "heuristic"
@@ -66,7 +66,7 @@ def compare_with_reflex(
     Without an optimal return over all conditions there is no context gap, and hence no row.
     """
     at = rows_where(table, robot=spec.name, over_time=False)
-    known = complete_optima(each for each in optima if each.robot == spec.name)
+    known = comparable_optima(each for each in optima if each.robot == spec.name)
     for arm in filter(is_usual, study.arms):
         controls = rows_where(at, arm=mapping_label(*arm.kind))
         for at_min, coupled in rows_where(controls, agent=COUPLING).groupby("at_min")["return"]:

@@ -11,7 +11,7 @@ from animat.neurons.fidelity import LARGEST_LOSS, Fidelity
 from animat.report.html import Columns, Table, cell, columns_of, table_of, with_error
 from animat.report.results import ComparedReturns, Results, StudyOptimum
 from animat.responses.quality.responses import FEW_SAMPLES
-from animat.studies.optima import complete_optima, key_of, kinds_over_time, read_optima
+from animat.studies.optima import comparable_optima, key_of, kinds_over_time, read_optima
 from animat.studies.outperforming import NOT
 from animat.studies.specification import Study, mapping_label
 from animat.studies.tabulating import FIRST, LEVEL, SECOND
@@ -85,9 +85,10 @@ def optima_table(optima: Sequence[StudyOptimum]) -> Table:
         "responses determine the value, bootstrapped 39 times; for threshold mappings, where an arm is evaluated. "
         "Run: the mean return of the controller that takes the best actions, on the robot itself, ± its standard "
         "error: a return that is achievable. The optimal return lies between the two; scores use the value, the upper "
-        "end. Highlighted: the two differ by more than 3 standard errors and the grid's error. Without clock: the same "
-        "controller without knowledge of the time left, which policies do not have either. Optima at every recording, "
-        "on a coarse grid, are in optima/."
+        "end. Highlighted: the two differ by more than 3 standard errors and the grid's error. If the controller "
+        "returns more, the grid is too coarse, and there are no scores. Without clock: the same controller without "
+        "knowledge of the time left, which policies do not have either. Optima at every recording, on a coarse grid, "
+        "are in optima/."
     )
     without = [row for row in optima if row.left_out is not None]
     if without:
@@ -104,7 +105,7 @@ def controllability_table(study: Study, folder: Path, kept: Mapping[float, Fidel
     """How often each condition exceeds the median in every recording, in the data and in the simulator."""
     kind = next(iter(kinds_over_time(study)), None)
     names = [spec.name for spec in study.robots] if kind else []
-    optima = {name: complete_optima(read_optima(folder, name, "over-time")) for name in names}
+    optima = {name: comparable_optima(read_optima(folder, name, "over-time")) for name in names}
     labels = next(iter(kept.values())).labels
     rows, marked = [], []
     for i, (at_min, of) in enumerate(kept.items()):
