@@ -7,6 +7,7 @@ import errno
 import io
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -273,6 +274,17 @@ def test_a_training_that_is_no_better_than_random_says_so(tmp_path: Path, capsys
     named = [each["name"] for each in results["findings"]]
     assert results["returns"]["p0"] < results["random"] and named == ["no-better-than-random"]
     assert "the policies are no better than random actions (" in said.err and "animat validate" not in said.err
+
+
+def test_what_is_warned_of_is_in_the_json_too(
+    recordings: Path, policies: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["evaluate", str(policies), "--recordings", str(recordings), "--episodes", "2"]
+    assert main([*command, "--range-hz", "5", "--json"]) == 0
+    said = capsys.readouterr()
+    warned = set(re.findall(r"^warning: ([a-z-]+): ", said.err, re.MULTILINE))
+    assert "binning" in warned
+    assert warned <= {finding["name"] for finding in last_json(said.out)["findings"]}
 
 
 def test_policies_of_a_training_that_is_not_finished_are_counted(

@@ -245,6 +245,11 @@ def simulator_settings(
     return settings
 
 
+def warnings_of(timeline: SimulatorTimeline | None) -> tuple[Finding, ...]:
+    """What was printed about the simulators' recordings, for JSON."""
+    return () if timeline is None else tuple(each for each in timeline.findings if each.severity != "note")
+
+
 def print_warnings(findings: Sequence[Finding]) -> None:
     """Print warnings, each once, to standard error, where they do not mix with results; notes are for `inspect`."""
     for message in warnings_once(findings):

@@ -9,7 +9,7 @@ from typing import Any
 
 from tyro.conf import Positional
 
-from animat.cli.command import SimulatorOptions, policies_for, print_warnings
+from animat.cli.command import SimulatorOptions, policies_for, print_warnings, warnings_of
 from animat.errors import AnimatError, InvalidArgument
 from animat.plain_file import read_plain_text
 from animat.records import json_data, write_json
@@ -86,7 +86,8 @@ class Evaluate(SimulatorOptions):
         print(evaluation.to_text())
         if self.out is not None:
             write_json(self.out, evaluation.to_dict())
-        return evaluation.to_dict()
+        found = (*warnings_of(timeline), *evaluation.findings)
+        return evaluation.to_dict() | {"findings": [finding.to_dict() for finding in found]}
 
 
 def _expect_no_other(out: Path) -> None:

@@ -11,7 +11,15 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional
 
-from animat.cli.command import JobOptions, SimulatorOptions, print_warnings, read_numbers, read_sac, robot_for
+from animat.cli.command import (
+    JobOptions,
+    SimulatorOptions,
+    print_warnings,
+    read_numbers,
+    read_sac,
+    robot_for,
+    warnings_of,
+)
 from animat.errors import InvalidArgument, UnusableData, counted, expect_at_least, in_file, in_min
 from animat.recordings.findings import Finding
 from animat.records import as_json
@@ -216,7 +224,7 @@ class Train(SimulatorOptions, JobOptions):
             "random": control["mean_return"],
             **{name: policies[name] for name in ("electrode_pulses", "net_return")},
             "recorded_at_min": evaluation.recorded_at_min,
-            "findings": [finding.to_dict() for finding in (*findings, *evaluation.findings)],
+            "findings": [each.to_dict() for each in (*warnings_of(timeline), *findings, *evaluation.findings)],
             **({"assessed": assessed} if assessed else {}),
         }
 

@@ -31,6 +31,7 @@ from animat.report.results import ComparedReturns, OverCultures, Results, Score
 from animat.report.returns import draw_over_cultures
 from animat.report.style import save_formats
 from animat.studies.arms import arm_differences, arms_table, begin, summarise_arms
+from animat.studies.folder import MANIFEST as STUDY
 from animat.studies.folder import REPORT, RESULTS, expect_same_specification
 from animat.studies.outperforming import not_outperforming_over
 from animat.studies.results import read_typed, write_of_cultures, write_parquet, write_records
@@ -101,6 +102,10 @@ def run_over_cultures(
     expect_no_other(folder, "cultures")
     for name, each in studies.items():
         expect_same_specification(each, folder / name)
+    for other in sorted(
+        {path.parent for path in folder.glob(f"culture-*/{STUDY}")} - {folder / name for name in studies}
+    ):
+        expect_same_specification(study, other, ignoring=("culture",))
     with exclusive_lock(folder):
         _write_manifest(folder, studies, {})
         with _choose_executor(workers, executor) as (shared, at_once):

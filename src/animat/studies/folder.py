@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import platform
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
@@ -137,11 +137,14 @@ def _expect_replaceable(
         raise folder_mismatch(folder, what, difference)
 
 
-def expect_same_specification(study: Study, folder: Path) -> None:
+def expect_same_specification(study: Study, folder: Path, ignoring: Sequence[str] = ()) -> None:
     """Refuse the folder of a study with another specification (Mismatch), without touching it."""
     found = read_description(folder / MANIFEST, "study")
+    if found is None:
+        return
     described = json.loads(json.dumps(asdict(study)))
-    if found is not None and found.get("study") != described:
+    described |= {name: found["study"][name] for name in ignoring if name in found.get("study", {})}
+    if found.get("study") != described:
         _expect_replaceable(folder, "study", found, found | {"study": described}, [MANIFEST, SPECIFICATION])
 
 
