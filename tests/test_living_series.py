@@ -56,6 +56,8 @@ def test_a_replay_is_recorded_at_its_minutes(tmp_path: Path) -> None:
     done = [update.args[0] for update in seen.update.mock_calls]
     # Two blocks a recording.
     assert list(dict.fromkeys(done)) == [0.5, 1.0, 1.5, 2.0, 2.5, 3.0]
+    rests = [update.args[:2] for update in seen.update.mock_calls if update.args[2] == "the culture rests"]
+    assert rests == [(1, 3), (2, 3)]
     assert [file.name for file in series.files] == [f"recording_{minute:04}_min.nwb" for minute in (0, 2, 4)]
     assert series.missed_min == []
     assert sorted(path.name for path in (tmp_path / "a").iterdir()) == [file.name for file in series.files]

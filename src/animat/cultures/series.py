@@ -128,7 +128,9 @@ def record_series(
             due_s = zero_s + session * interval_s
             if (virtual is None and file.exists()) or culture.now_s >= due_s + interval_s:
                 continue
-            culture.rest(max(0.0, due_s - culture.now_s))
+            if (left_s := due_s - culture.now_s) > 0:
+                progress.update(session, sessions, "the culture rests")
+                culture.rest(left_s)
             # Checked again before each recording, which is not made if it cannot be written.
             expect_writable(folder, room_bytes=room_bytes)
             part = Part(progress, session, 1, sessions, file.name)
