@@ -47,8 +47,8 @@ class Run(StimulationOptions):
     state: Path | None = None
     """State that a virtual culture continues from; default: culture.state next to the recordings, if it exists"""
     episodes: int = 5
-    """Episodes of each policy; each control has at most as many; all controls share as many as all policies have
-    together, but at least 5 each"""
+    """Episodes of each policy. All controls share as many as all policies have together; each has at least 5, unless
+    a policy has fewer, and at most as many as a policy"""
     controls: Literal["all", "random", "coupling"] = "all"
     """all: random, constant, silent, shuffled and heuristic; random: only that one; coupling: all, and the best reflex,
     searched for on the simulator first, which takes a minute"""
