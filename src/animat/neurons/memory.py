@@ -176,11 +176,11 @@ def _find_memory(ranked: Ranked) -> Memory:
     if not rows:
         return NO_MEMORY
     # With all responses as neighbours the history does not matter.
-    errors = {NO_MEMORY: _errors(ranked.rank, np.zeros(len(ranked.rank)), rows, 1.0)}
+    errors = {NO_MEMORY: _errors(ranked.rank, np.zeros(len(ranked.rank)), rows, [1.0])[0]}
     for decay, weight in itertools.product(_DECAYS, _WEIGHTS):
         history = ranked.traces(Memory(decay, weight, 1.0))
-        for neighbour_exponent in _EXPONENTS:
-            errors[Memory(decay, weight, neighbour_exponent)] = _errors(ranked.rank, history, rows, neighbour_exponent)
+        of_exponents = _errors(ranked.rank, history, rows, _EXPONENTS)
+        errors |= {Memory(decay, weight, each): of for each, of in zip(_EXPONENTS, of_exponents, strict=True)}
     best = min(errors, key=lambda memory: float(errors[memory].mean()))
 
     def is_as_good(memory: Memory, standard_errors: float) -> bool:
@@ -253,23 +253,25 @@ def _errors(
     rank: Float64[np.ndarray, " responses"],
     history: Float64[np.ndarray, " responses"],
     of_conditions: Sequence[Int64[np.ndarray, " rows"]],
-    neighbour_exponent: float,
-) -> Float64[np.ndarray, " rows"]:
-    """Squared differences of each rank from the mean rank of its n^neighbour_exponent neighbours by history.
+    neighbour_exponents: Sequence[float],
+) -> list[Float64[np.ndarray, " rows"]]:
+    """Squared differences of each rank from the mean rank of its n^exponent neighbours by history, for each exponent.
 
     If more have the same history, all of these are neighbours, as in `MemorySimulator.rows_near`: their order is that
     of time, in which drift would look like a memory.
     """
-    errors = np.full(len(rank), np.nan)
+    errors = np.full((len(neighbour_exponents), len(rank)), np.nan)
     for of_condition in of_conditions:
         rows = of_condition[np.argsort(history[of_condition], kind="stable")]
-        n, at = len(rows), history[rows]
-        k = int(min(np.rint(n**neighbour_exponent), n - 1))
+        n, at, own = len(rows), history[rows], rank[rows]
         smaller, no_larger = at.searchsorted(at, "left"), at.searchsorted(at, "right")
-        first = np.clip(np.arange(n) - k // 2, 0, n - k - 1)
-        is_common = no_larger - smaller > k + 1
-        begin, end = np.where(is_common, smaller, first), np.where(is_common, no_larger, first + k + 1)
-        below = np.concatenate([[0.0], np.cumsum(rank[rows])])
-        others = below[end] - below[begin] - rank[rows]
-        errors[rows] = (rank[rows] - others / (end - begin - 1)) ** 2
-    return np.asarray(errors[~np.isnan(errors)])
+        alike, here = no_larger - smaller, np.arange(n)
+        below = np.concatenate([[0.0], np.cumsum(own)])
+        for of_exponent, neighbour_exponent in zip(errors, neighbour_exponents, strict=True):
+            k = int(min(np.rint(n**neighbour_exponent), n - 1))
+            first = np.minimum(np.maximum(here - k // 2, 0), n - k - 1)
+            is_common = alike > k + 1
+            begin, end = np.where(is_common, smaller, first), np.where(is_common, no_larger, first + k + 1)
+            others = below[end] - below[begin] - own
+            of_exponent[rows] = (own - others / (end - begin - 1)) ** 2
+    return [np.asarray(each[~np.isnan(each)]) for each in errors]
