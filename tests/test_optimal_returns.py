@@ -112,6 +112,20 @@ def answers(n: Sequence[int], seed: int, spread: Sequence[float] = SPREAD) -> Re
     )
 
 
+def test_a_surpassed_optimum_has_no_context_gap(monkeypatch: pytest.MonkeyPatch) -> None:
+    low = Optimum(-60.0, 1.0, 50.0, 2.0, 40.0, 2.0, 100, 10)
+    for name, stand_in in {
+        "best_returns": lambda *_, **__: [low, replace(low, value=70.0)],
+        "best_coupling": lambda *_, **__: Uniform(),
+    }.items():
+        monkeypatch.setattr(f"animat.evaluation.optimal_returns.{name}", stand_in)
+    monkeypatch.setattr(WellSampled, "with_interval", lambda self, best, **_: best)
+    surpassed, sound = optimal_returns(answers([60] * 5, 1), Cartpole(), episodes=20)
+    assert surpassed.context is None is surpassed.to_dict()["context"]
+    assert surpassed.to_text().endswith("; no context gap, as its controller surpasses it")
+    assert sound.context is not None and "context gap" in sound.to_text()
+
+
 def test_three_responses_promise_nothing() -> None:
     with pytest.raises(UnusableData, match="expected at least 30 non-burst ones to some condition, got at most 3"):
         optimal_returns(answers([3] * 5, 1), SHORT)

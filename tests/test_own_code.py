@@ -134,6 +134,7 @@ def rover(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
         ("return 1", "return 2", False),
         ("    def observe(self, state):", '    def observe(self, state):\n        """New."""', True),
         ("SIGN = 7", "SIGN = 8", True),
+        ("    SIGN = 7", "    SIGN = 7\nelse:\n    SIGN = 1.5", False),
         ("Rover.friction = 0.5", "Rover.friction = 0.6", False),
         ("GAINS.append(2.0)", "GAINS.append(3.0)", False),
         ("OTHER = 2.0", "OTHER = 3.0", False),

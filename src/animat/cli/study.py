@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -93,7 +93,9 @@ def _run_many(study: Study, base: Path, command: JobOptions) -> dict[str, Any]:
         print("\n".join(align_columns(head, cells)))
     for message in results.not_outperforming:
         print(message)
-    print_warnings(results.findings)
+    print_warnings(
+        [replace(each, message=f"{name}: {each.message}") for name, of in results.warnings.items() for each in of]
+    )
     jobs = sum(len(each.done_now) for each in results.finished.values())
     done = f"{counted(len(results.finished), 'culture')}, {counted(jobs, 'job')}"
     print(f"{done} in {time.monotonic() - began:.0f} s; report: {report}")

@@ -146,7 +146,8 @@ class OptimalReturn:
 
     Attributes:
         random: mean return of random stimuli.
-        context: how much of it a coupling from sensors to stimuli leaves unused.
+        context: how much of it a coupling from sensors to stimuli leaves unused; None if `best` is too low to tell, as
+            its own controller surpasses it.
     """
 
     robot: str
@@ -154,16 +155,18 @@ class OptimalReturn:
     random: float
     random_standard_error: float
     best: Optimum
-    context: ContextGap
+    context: ContextGap | None
 
     def to_dict(self) -> dict[str, Any]:
         """Everything as plain data."""
-        return vars(self) | {"best": self.best.to_dict(), "context": self.context.to_dict()}
+        context = None if self.context is None else self.context.to_dict()
+        return vars(self) | {"best": self.best.to_dict(), "context": context}
 
     def to_text(self) -> str:
         """One line."""
         random = f"random {self.random:.1f} +- {self.random_standard_error:.1f}"
-        return f"{self.robot}, {self.mapping}: {random}; {self.best.to_text()}; {self.context.to_text()}"
+        context = "no context gap, as its controller surpasses it" if self.context is None else self.context.to_text()
+        return f"{self.robot}, {self.mapping}: {random}; {self.best.to_text()}; {context}"
 
 
 @checked_arguments
@@ -210,6 +213,8 @@ def optimal_returns(
         random = roll_out(*case, Uniform(), episodes=episodes, seed=seed).returns[0]
         coupling = best_coupling(*case, seed=seed, progress=Part(searching, len(optima), 1, n))
         of_coupling = roll_out(*case, coupling, episodes=episodes, seed=seed).returns[0]
-        known = float(random.mean()), standard_error(random), optimum, context_gap(of_coupling, random, optimum)
-        optima.append(OptimalReturn(robot.name, mapping.name, *known))
+        context = None if optimum.is_surpassed else context_gap(of_coupling, random, optimum)
+        optima.append(
+            OptimalReturn(robot.name, mapping.name, float(random.mean()), standard_error(random), optimum, context)
+        )
     return tuple(optima)

@@ -24,12 +24,22 @@ def code_of(thing: Any) -> dict[str, str]:
 
 def code_at(module: str, name: str) -> dict[str, str]:
     """The same for a module by its name, as the code of what is called `name`."""
-    with suppress(OSError, ValueError, SyntaxError, ImportError):
+    with suppress(OSError, ValueError, SyntaxError, ImportError, RecursionError):
         file = getattr(sys.modules.get(module), "__file__", None) or getattr(find_spec(module), "origin", None)
         if file is not None:
-            code = ast.unparse(_Plain().visit(ast.parse(Path(file).read_bytes())))
+            code = repr(_structure(_Plain().visit(ast.parse(Path(file).read_bytes()))))
             return {f"code of {name}": f"sha256 {hashlib.sha256(code.encode()).hexdigest()[:16]}"}
     return {}
+
+
+def _structure(node: Any) -> Any:
+    """A syntax tree as nested tuples that are the same in every version of Python: without fields that are empty."""
+    if isinstance(node, list):
+        return tuple(map(_structure, node))
+    if not isinstance(node, ast.AST):
+        return node
+    known = ((name, value) for name, value in ast.iter_fields(node) if value not in (None, []))
+    return type(node).__name__, *((name, _structure(value)) for name, value in known)
 
 
 class _Plain(ast.NodeTransformer):
@@ -38,5 +48,6 @@ class _Plain(ast.NodeTransformer):
     def visit_Expr(self, node: ast.Expr) -> ast.AST | None:
         return None if isinstance(node.value, ast.Constant) else node
 
-    def visit_If(self, node: ast.If) -> ast.AST | None:
-        return None if ast.unparse(node.test).startswith("__name__ ==") else self.generic_visit(node)
+    def visit_If(self, node: ast.If) -> ast.AST | list[ast.stmt]:
+        self.generic_visit(node)
+        return node.orelse if ast.unparse(node.test) == "__name__ == '__main__'" else node

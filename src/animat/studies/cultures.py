@@ -5,11 +5,10 @@ from __future__ import annotations
 import json
 import os
 import threading
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -52,8 +51,8 @@ MANIFEST = "cultures.json"
 class CulturesRun:
     """Results of each finished culture, errors of the others, and a summary; `parquet`: None without fastparquet.
 
-    `findings` are the warnings of the finished cultures; each begins with the name of its culture. `not_outperforming`
-    has a sentence for each arm whose policies do not outperform the heuristic policy in some of them.
+    `warnings` are those of each finished culture. `not_outperforming` has a sentence for each arm whose policies do not
+    outperform the heuristic policy in some of them.
     """
 
     folder: Path
@@ -62,7 +61,7 @@ class CulturesRun:
     comparisons: dict[str, tuple[ComparedReturns, ...]]
     summary: tuple[OverCultures, ...]
     parquet: Path | None
-    findings: tuple[Finding, ...] = ()
+    warnings: Mapping[str, tuple[Finding, ...]] = field(default_factory=dict)
     not_outperforming: tuple[str, ...] = ()
 
 
@@ -126,14 +125,12 @@ def run_over_cultures(
         write_records(folder / SUMMARY, OverCultures, summary)
         write_of_cultures(folder / SCORES, Score, scores)
         parquet = write_parquet((folder / SCORES).with_suffix(".parquet"), Score, scores)
-    findings = tuple(
-        replace(finding, message=f"{name}: {finding.message}")
+    warnings = {
+        name: tuple(finding for finding in each.findings if finding.severity != "note")
         for name, each in results.items()
-        for finding in each.findings
-        if finding.severity != "note"
-    )
+    }
     heuristic = tuple(not_outperforming_over(results.values()))
-    return CulturesRun(folder, finished, failed, comparisons, summary, parquet, findings, heuristic)
+    return CulturesRun(folder, finished, failed, comparisons, summary, parquet, warnings, heuristic)
 
 
 def _write_manifest(folder: Path, names: Iterable[str], failed: Mapping[str, str]) -> None:
@@ -228,11 +225,8 @@ def write_cultures_page(study: Study, found: CulturesRun) -> Path:
         sentences = tuple(f"{begin(sentence)}." for sentence in found.not_outperforming)
         sections.append(Section("Against the heuristic policy", sentences))
     pages = {name: f"{name}/{REPORT}" for name in found.finished}
-    warned = Counter(finding.message.partition(":")[0] for finding in found.findings)
-    points = [
-        (name, f"finished: {page}" + (f", {counted(warned[name], 'warning')}" if warned[name] else ""))
-        for name, page in pages.items()
-    ]
+    warned = {name: f", {counted(len(each), 'warning')}" if each else "" for name, each in found.warnings.items()}
+    points = [(name, f"finished: {page}{warned.get(name, '')}") for name, page in pages.items()]
     points += [(name, f"failed: {why}") for name, why in found.failed.items()]
     sections.append(Section("Each culture", points=tuple(points), links=tuple(pages.values())))
     cultures = counted(len(found.finished), "culture") + (f", {len(found.failed)} more failed" if found.failed else "")

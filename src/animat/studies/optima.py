@@ -51,6 +51,14 @@ def comparable_optima(optima: Iterable[StudyOptimum]) -> dict[tuple[str, str, fl
     return {key_of(optimum, optimum.at_min): optimum for optimum in optima if optimum.is_for_scores}
 
 
+def optima_over_time(folder: Path, robot: str) -> dict[tuple[str, str, float], StudyOptimum]:
+    """The same at every recording, on a coarse grid; none with a mapping for which a finer grid is too coarse."""
+    surpassed = {each.mapping_kind for each in read_optima(folder, robot) if each.is_surpassed}
+    return comparable_optima(
+        each for each in read_optima(folder, robot, "over-time") if each.mapping_kind not in surpassed
+    )
+
+
 def key_of(of: Arm | StudyOptimum, at_min: float) -> tuple[str, str, float]:
     """What identifies an optimum on a robot: without neurons every minute is the same."""
     return of.mapping, of.percentiles, 0.0 if of.mapping == "none" else at_min

@@ -11,7 +11,7 @@ from animat.neurons.fidelity import LARGEST_LOSS, Fidelity
 from animat.report.html import Columns, Table, cell, columns_of, table_of, with_error
 from animat.report.results import ComparedReturns, Results, StudyOptimum
 from animat.responses.quality.responses import FEW_SAMPLES
-from animat.studies.optima import comparable_optima, key_of, kinds_over_time, read_optima
+from animat.studies.optima import key_of, kinds_over_time, optima_over_time
 from animat.studies.outperforming import NOT
 from animat.studies.specification import Study, mapping_label
 from animat.studies.tabulating import FIRST, LEVEL, SECOND
@@ -105,7 +105,7 @@ def controllability_table(study: Study, folder: Path, kept: Mapping[float, Fidel
     """How often each condition exceeds the median in every recording, in the data and in the simulator."""
     kind = next(iter(kinds_over_time(study)), None)
     names = [spec.name for spec in study.robots] if kind else []
-    optima = {name: comparable_optima(read_optima(folder, name, "over-time")) for name in names}
+    optima = {name: optima_over_time(folder, name) for name in names}
     labels = next(iter(kept.values())).labels
     rows, marked = [], []
     for i, (at_min, of) in enumerate(kept.items()):
