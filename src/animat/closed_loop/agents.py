@@ -85,8 +85,7 @@ class Agent:
             place of the response; `"yoked"`: the stimuli of the last whole episode of one of its controllers are
             repeated.
         calibrates: whether its responses count for adaptive thresholds; responses to one condition differ when it is
-            presented over and over. Those of a warm-up never count, and the
-            later ones of the settling always do.
+            presented over and over. The warm-up of its episodes always counts.
         drawn_from: responses from which one is drawn in place of the culture's; None: the culture's own is read.
         is_turned_round: whether every command is reversed.
         switch_at: the iteration after which the robot gets another goal; None: never.

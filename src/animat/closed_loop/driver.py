@@ -138,7 +138,7 @@ class Driver:
             elif agent.delivery == "yoked":
                 delivered = source[iteration % len(source)]
             for repeats in itertools.count():
-                tick = self._present(agent, episode, iteration, chosen, delivered, repeats, agent.calibrates)
+                tick = self._present(agent, episode, iteration, chosen, delivered, repeats)
                 if tick.handled != "repeated":
                     break
             conditions.append(delivered)
@@ -162,10 +162,9 @@ class Driver:
         self._observe((), self.loop.pause_s, self._now_s(), pause=True)
         # The first pulse comes as if one had been delivered at the end of the pause.
         self._last_pulse_s = self._now_s()
-        for number in range(rounds):
-            # In the first rounds a culture is still rested: thresholds that followed it would be too high.
+        for _ in range(rounds):
             for condition in self._rng.permutation(len(self.loop.conditions)).tolist():
-                self._present(agent, episode, -1, condition, condition, 0, number >= (self.loop.warm_up or 0))
+                self._present(agent, episode, -1, condition, condition, 0)
 
     def _choose(self, agent: Agent, controller: Controller, seen: Float64[np.ndarray, " observed"]) -> int:
         n = len(self.loop.conditions)
@@ -174,9 +173,7 @@ class Driver:
             raise Stop(Ending("controller", f"{agent.name} chose {chosen}: expected a condition from 0 to {n - 1}"))
         return chosen
 
-    def _present(
-        self, agent: Agent, episode: int, iteration: int, chosen: int, delivered: int, repeats: int, counts: bool
-    ) -> Tick:
+    def _present(self, agent: Agent, episode: int, iteration: int, chosen: int, delivered: int, repeats: int) -> Tick:
         """Present a condition and move the robot by the response, unless it is repeated or warms the culture up."""
         loop, is_warm_up = self.loop, iteration < 0
         frequency_hz = self._dealer.frequency_hz(delivered)
@@ -225,7 +222,7 @@ class Driver:
                 raise Stop(Ending("lateness", f"a pulse came {1000 * late_s:.3g} ms late, and on_late is stop"))
             if tick.handled == "unfinished":
                 tick = replace(tick, **self._move(agent, x_hz, is_burst, iteration))
-            if self._adaptive is not None and stimuli and counts and not is_burst:
+            if self._adaptive is not None and stimuli and (agent.calibrates or is_warm_up) and not is_burst:
                 self._adaptive.add(delivered, at_trial, np.asarray(x_hz))
                 self._percentiles = self._adaptive.percentiles()
                 adapted["percentiles_hz"] = self._percentiles.tolist()

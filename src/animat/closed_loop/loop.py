@@ -61,11 +61,9 @@ class Loop:
         on_late: after a late pulse: `"continue"`, or `"stop"` the session; it is logged.
         pause_s: seconds without a stimulus before each episode, and each time in the settling.
         warm_up: trials of each condition after the pause, in random order, before the robot moves: a rested culture
-            responds differently from a recorded one, and so moves no thresholds. None: 2 where an action is one pulse,
-            0 where it is several.
-        settling: how many times `pause_s` and `SETTLING_ROUNDS` of all conditions precede the first episode, so that
-            thresholds adapt to those after the first `warm_up`. None: `SETTLINGS` where thresholds adapt and an action
-            is one pulse, else 0.
+            responds differently from a recorded one. None: 2 where an action is one pulse, 0 where it is several.
+        settling: how many times `pause_s` and a warm-up of `SETTLING_ROUNDS` precede the first episode, so that
+            thresholds adapt. None: `SETTLINGS` where thresholds adapt and an action is one pulse, else 0.
         patience_s: time beyond the expected that a culture may take to answer before it counts as hung; and the time
             that the robot, and an agent, may take.
         real_time: whether a simulated culture is held back to real time; a device always keeps its own.
