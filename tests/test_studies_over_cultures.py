@@ -263,6 +263,8 @@ def test_another_study_is_refused_before_it_touches_the_folder(tmp_path: Path, m
         Mismatch, match=r"culture-[12]: expected a folder of this study, got one of another \(study.policies"
     ):
         run_over_cultures(replace(study, policies=study.policies + 1, culture=Source(seeds="3")), tmp_path)
+    with pytest.raises(Mismatch, match=r"culture-1: .* of another \(study.culture.sessions: 15 there, 2 now\)"):
+        run_over_cultures(replace(study, culture=Source(seeds="3", sessions=2)), tmp_path)
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
     assert list(run_over_cultures(replace(study, culture=Source(seeds="1-3")), tmp_path).finished)[-1] == "culture-3"
     for name in ("culture-1", "culture-2", "culture-3"):

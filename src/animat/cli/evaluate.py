@@ -84,10 +84,11 @@ class Evaluate(SimulatorOptions):
             )
         print_warnings(evaluation.findings)
         print(evaluation.to_text())
+        findings = (*warnings_of(timeline), *evaluation.findings)
+        result = evaluation.to_dict() | {"findings": [finding.to_dict() for finding in findings]}
         if self.out is not None:
-            write_json(self.out, evaluation.to_dict())
-        found = (*warnings_of(timeline), *evaluation.findings)
-        return evaluation.to_dict() | {"findings": [finding.to_dict() for finding in found]}
+            write_json(self.out, result)
+        return result
 
 
 def _expect_no_other(out: Path) -> None:

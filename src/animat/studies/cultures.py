@@ -104,7 +104,7 @@ def run_over_cultures(
     for other in sorted(
         {path.parent for path in folder.glob(f"culture-*/{STUDY}")} - {folder / name for name in studies}
     ):
-        expect_same_specification(study, other, ignoring=("culture",))
+        expect_same_specification(study, other, of_culture=False)
     with exclusive_lock(folder):
         _write_manifest(folder, studies, {})
         with _choose_executor(workers, executor) as (shared, at_once):

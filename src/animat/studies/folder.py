@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import platform
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
@@ -137,14 +137,18 @@ def _expect_replaceable(
         raise folder_mismatch(folder, what, difference)
 
 
-def expect_same_specification(study: Study, folder: Path, ignoring: Sequence[str] = ()) -> None:
-    """Refuse the folder of a study with another specification (Mismatch), without touching it."""
+def expect_same_specification(study: Study, folder: Path, *, of_culture: bool = True) -> None:
+    """Refuse the folder of a study with another specification (Mismatch), without touching it.
+
+    If it need not be `of_culture`, it may be the study's of another culture.
+    """
     found = read_description(folder / MANIFEST, "study")
     if found is None:
         return
-    described = json.loads(json.dumps(asdict(study)))
-    described |= {name: found["study"][name] for name in ignoring if name in found.get("study", {})}
-    if found.get("study") != described:
+    described, there = json.loads(json.dumps(asdict(study))), found.get("study")
+    if not of_culture and isinstance(there, dict):
+        described["culture"] |= {name: there["culture"].get(name) for name in ("seed", "seeds", "files", "folders")}
+    if there != described:
         _expect_replaceable(folder, "study", found, found | {"study": described}, [MANIFEST, SPECIFICATION])
 
 
