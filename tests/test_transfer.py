@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -53,9 +54,11 @@ def a_recording(start_min: float, order: str = "mixed", *, memory: bool = False)
 
 
 def ran(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict[str, Any]:
-    """A command's line of JSON."""
+    """A command's line of JSON, in which everything is that it warns of."""
     assert main([*arguments, "--json"]) == 0
-    found: dict[str, Any] = json.loads(capsys.readouterr().out.splitlines()[-1])
+    said = capsys.readouterr()
+    found: dict[str, Any] = json.loads(said.out.splitlines()[-1])
+    assert {*re.findall(r"^warning: ([a-z-]+): ", said.err, re.MULTILINE)} <= {f["name"] for f in found["findings"]}
     return found
 
 
