@@ -287,6 +287,19 @@ def test_what_is_warned_of_is_in_the_json_too(
     assert warned <= {finding["name"] for finding in last_json(said.out)["findings"]}
 
 
+@pytest.mark.oracle
+def test_what_training_warns_of_is_in_the_json_too(
+    recordings: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    few = ["--policies", "1", "--iterations", "480", "--range-hz", "5"]
+    command = ["train", "cartpole", "--recordings", str(recordings), *few, "--out", str(tmp_path / "out"), "--json"]
+    assert main(command) == 0
+    said = capsys.readouterr()
+    warned = set(re.findall(r"^warning: ([a-z-]+): ", said.err, re.MULTILINE))
+    assert "binning" in warned
+    assert warned <= {finding["name"] for finding in last_json(said.out)["findings"]}
+
+
 def test_policies_of_a_training_that_is_not_finished_are_counted(
     recordings: Path, policies: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

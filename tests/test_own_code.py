@@ -191,7 +191,8 @@ def test_the_code_of_a_gymnasium_environment_of_one_s_own_counts_too(
 def test_an_environment_made_by_a_partial_function_has_versions() -> None:
     gymnasium.register("Partial-v0", entry_point=partial(PendulumEnv, g=9.0), max_episode_steps=20)
     try:
-        assert "gymnasium" in versions_of((), [robot_named("gymnasium:Partial-v0")])
+        found = versions_of((), [robot_named("gymnasium:Partial-v0")])
+        assert "gymnasium" in found and not [name for name in found if "code" in name]
     finally:
         gymnasium.registry.pop("Partial-v0")
 

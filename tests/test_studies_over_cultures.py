@@ -266,6 +266,8 @@ def test_another_study_is_refused_before_it_touches_the_folder(tmp_path: Path, m
     with pytest.raises(Mismatch, match=r"culture-1: .* of another \(study.culture.sessions: 15 there, 2 now\)"):
         run_over_cultures(replace(study, culture=Source(seeds="3", sessions=2)), tmp_path)
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+    # What is damaged is a matter of its own culture.
+    (tmp_path / "culture-2" / "study.json").write_text("{")
     assert list(run_over_cultures(replace(study, culture=Source(seeds="1-3")), tmp_path).finished)[-1] == "culture-3"
     for name in ("culture-1", "culture-2", "culture-3"):
         shutil.rmtree((tmp_path / name / RESULTS).parent)

@@ -86,9 +86,7 @@ class Evaluation:
         is not the same culture.
         """
         random = next((each for each in self.rows if each.name == "random"), None)
-        if random is None or self.optimum is None or row.changed:
-            return None
-        if self.optimum.left_out or self.optimum.is_surpassed:
+        if random is None or self.optimum is None or not self.optimum.is_for_scores or row.changed:
             return None
         mean, at_random, best = float(row.mean_returns.mean()), float(random.mean_returns.mean()), self.optimum.value
         return normalised_score(mean, at_random, best) if best > at_random else None
@@ -177,7 +175,7 @@ class Evaluation:
         if self.optimum.left_out:
             meaning = "no score, as the optimal return leaves out conditions that the rows use"
         elif self.optimum.is_surpassed:
-            meaning = "no score, as the optimal return is less than its controller's: use a higher resolution"
+            meaning = "no score, as the optimal return is less than its controller's"
         elif not self.rows[0].changed and self.score(self.rows[0]) is None:
             has_random = any(row.name == "random" for row in self.rows)
             reason = "the optimal return is not above that of" if has_random else "there are no"

@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 import platform
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from animat.coding.mapping import mapping_named
-from animat.errors import InvalidArgument, Mismatch, as_invalid_file
+from animat.errors import InvalidArgument, InvalidFile, Mismatch, as_invalid_file
 from animat.execution.receipts import sha256
 from animat.execution.task import NOTICES, UNFINISHED
 from animat.folders import first_difference, folder_mismatch, read_description, with_fingerprint
@@ -142,7 +142,10 @@ def expect_same_specification(study: Study, folder: Path, *, of_culture: bool = 
 
     If it need not be `of_culture`, it may be the study's of another culture.
     """
-    found = read_description(folder / MANIFEST, "study")
+    found = None
+    with suppress(InvalidFile):
+        # What is damaged is found when this culture's study is run.
+        found = read_description(folder / MANIFEST, "study")
     if found is None:
         return
     described, there = json.loads(json.dumps(asdict(study))), found.get("study")

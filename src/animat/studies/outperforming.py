@@ -63,7 +63,7 @@ def compare_with_reflex(
 ) -> Iterator[ReflexComparison]:
     """Compare each arm that `is_usual` at the minute at which the best coupling was run; `table` is of episodes.
 
-    Without an optimal return over all conditions there is no context gap, and hence no row.
+    Without an optimal return that is for scores there is no context gap, and hence no row.
     """
     at = rows_where(table, robot=spec.name, over_time=False)
     known = comparable_optima(each for each in optima if each.robot == spec.name)

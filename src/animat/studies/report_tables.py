@@ -22,8 +22,9 @@ _MOST_ROWS = 40
 _SCORE_NOTE = (
     "Optimum: the optimal return of any controller with the same neurons, mapping and robot, by dynamic "
     "programming. Score: (mean − random) / (optimum − random); 0 is as good as random actions, 1 is the optimum, which "
-    "can be exceeded by chance. A control, whose delivered stimuli are drawn at random, has no optimum: whatever it "
-    "chooses is as good as random."
+    "can be exceeded by chance. There is none if the optimum leaves out conditions, or if its own controller returns "
+    "more. A control, whose delivered stimuli are drawn at random, has no optimum: whatever it chooses is as good as "
+    "random."
 )
 
 

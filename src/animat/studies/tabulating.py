@@ -126,7 +126,7 @@ class References:
         return self._random.get(key_of(arm, at_min))
 
     def optimum(self, arm: Arm, at_min: float) -> StudyOptimum | None:
-        """The optimum; None for the control, which has none, and where it leaves out conditions."""
+        """The optimum; None for the control, which has none, and where it is not for scores."""
         return None if arm.delivery == "shuffled" else self._optima.get(key_of(arm, at_min))
 
     def best_return(self, arm: Arm, at_min: float) -> float | None:

@@ -83,10 +83,10 @@ class _Run:
         tune = tuning.tune
         self._first = min(len(first_settings(tuning.study, tuning.space)), tune.trials)
         self._progress, self._done_s = progress, 0.0
-        batches = -(-tune.trials // tune.together)
-        finals = tune.finalists + self._first
-        self._total_s = 20 + batches * self._batch_s(min(tune.together, tune.trials))
-        self._total_s += self._cost_s(tuning.study.policies * finals, CHUNKS) + _COMPILING_S * finals
+        batches = (min(tune.together, tune.trials - first) for first in range(0, tune.trials, tune.together))
+        finals, groups = tune.finalists + self._first, len(split_groups(tuning.study.policies))
+        self._total_s = 20 + sum(map(self._batch_s, batches))
+        self._total_s += self._cost_s(tuning.study.policies * finals, CHUNKS) + _COMPILING_S * finals * groups
 
     def fit(self, base: Path) -> None:
         """Make the recordings, and simulators of every kind in the search."""
