@@ -335,6 +335,17 @@ def test_a_hang_up_that_is_ignored_stays_so() -> None:
         signal.signal(signal.SIGHUP, before)
 
 
+def test_arguments_of_the_wrong_kind_are_refused_in_a_line(tmp_path: Path) -> None:
+    with pytest.raises(InvalidArgument, match="make_culture: expected a function that returns a culture, got None"):
+        record_series(lambda: None, SHORT, tmp_path)  # type: ignore[arg-type, return-value]
+    with FakeCulture() as culture:
+        with pytest.raises(InvalidArgument, match="seed: expected a whole number, got 'a'"):
+            culture.record(SHORT, seed="a")  # type: ignore[arg-type]
+        with pytest.raises(InvalidArgument, match="electrodes: expected a list of electrodes, got 5"):
+            culture.stimulate(5, SHORT.pulse)  # type: ignore[arg-type]
+        assert culture.pulses == 0
+
+
 def test_a_seed_below_0_is_refused_before_a_device_is_touched(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -15,6 +15,7 @@ from typing import Any, ClassVar, final
 import numpy as np
 from jaxtyping import Int64
 
+from animat.arguments import check_argument
 from animat.cultures.failures import as_device_failure
 from animat.cultures.limits import Limits
 from animat.cultures.observed import Observed, Spikes, assemble, following, with_rests
@@ -180,6 +181,7 @@ class Culture(Openable):
         Raises:
             UnsafeStimulus, InvalidArgument, DeviceFailed: as `deliver` does.
         """
+        expect_kind("electrodes", electrodes, Iterable, "a list of electrodes")
         edges_ms = tuple(window_ms) if isinstance(window_ms, Iterable) else ()
         if len(edges_ms) != 2:
             raise InvalidArgument(f"window_ms: expected a start and an end, such as (2.0, 10.0), got {window_ms!r}")
@@ -201,6 +203,7 @@ class Culture(Openable):
                 culture, or more patterns than it has.
         """
         expect_kind("protocol", protocol, Protocol, "a Protocol, such as Protocol(trials=5)")
+        check_argument("seed", seed, int)
         table, sites = self.channels, self.stimulation_electrodes
         row_of = {electrode: row for row, electrode in enumerate(table.electrode.tolist())}
         rows = [row_of.get(electrode, UNKNOWN) for electrode in sites]

@@ -18,7 +18,7 @@ from animat.cultures.base import Culture
 from animat.cultures.same_culture import other_patterns
 from animat.cultures.under_way import PartialRecording
 from animat.cultures.virtual import VirtualCulture
-from animat.errors import InvalidArgument, Mismatch, expect_at_least, shown
+from animat.errors import InvalidArgument, Mismatch, expect_at_least, expect_kind, shown
 from animat.folders import first_difference
 from animat.progress import Part, Progress, Silent
 from animat.recordings.formats.nwb import recording_name, write_nwb
@@ -92,6 +92,7 @@ def record_series(
     folder, progress = Path(folder), progress or Silent()
     with exclusive_lock(folder), ExitStack() as opened:
         culture, recorded, zero_s = make_culture(), 0, 0.0
+        expect_kind("make_culture", culture, Culture, "a function that returns a culture")
         if not isinstance(protocol, Protocol):
             protocol = protocol(culture)
         if seed is None:
