@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -15,7 +16,7 @@ from hypothesis import strategies as st
 from animat.cultures.devices import cl1_source
 from animat.cultures.devices.cl1 import NO_STIMULATION
 from animat.cultures.devices.cl1_source import BEFORE, REAL_TIME_NEURONS, SAMPLES, SimulatedCL1
-from animat.errors import InvalidArgument
+from animat.errors import DeviceFailed, InvalidArgument
 
 
 def event(frame: int, channel: int, ua: float = 2.0) -> Any:
@@ -139,6 +140,12 @@ def test_a_culture_too_large_for_real_time_says_so(
 def test_settings_that_cannot_be_are_refused(bad: dict[str, float]) -> None:
     with pytest.raises(InvalidArgument, match="expected above 0"):
         SimulatedCL1(1, **bad)  # type: ignore[arg-type]
+
+
+def test_without_the_sdk_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "cl", None)
+    with pytest.raises(DeviceFailed, match="expected the vendor's package cl-sdk .* pip install"):
+        cl1_source.use_simulated_culture(seed=1)
 
 
 def test_by_default_it_has_as_many_neurons_as_the_page_says() -> None:

@@ -6,20 +6,18 @@ import os
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from types import ModuleType
 from typing import ClassVar
 
 import numpy as np
 from jaxtyping import Int64
 
 from animat.cultures.base import Culture
-from animat.cultures.devices.cl1_delivery import FRAMES_PER_S, LEAD_US, Session
-from animat.cultures.failures import as_device_failure, describe_error, vendor_module, while_open
+from animat.cultures.devices.cl1_delivery import FRAMES_PER_S, LEAD_US, Session, sdk
+from animat.cultures.failures import as_device_failure, describe_error, while_open
 from animat.cultures.holding import of_the_machine, of_the_program
 from animat.cultures.observed import Observed, Spikes
 from animat.cultures.safety import Admitted, Guard, History, Limits
 from animat.errors import AnimatError, DeviceFailed, InvalidArgument
-from animat.extras import install_command
 from animat.recordings.formats.cl1_layout import CHANNELS, IDENTIFIERS, NO_STIMULATION, SITES, STIMULUS_STREAM
 from animat.recordings.recorded_culture import RecordedCulture, names_in
 from animat.recordings.recording import Channels
@@ -138,7 +136,7 @@ class CL1Culture(Culture):
     @property
     def device(self) -> Path:
         """The CL1 on this machine; each program has its own SDK simulator."""
-        return of_the_program("cl1-simulator") if _sdk().is_simulator() else of_the_machine("cl1")
+        return of_the_program("cl1-simulator") if sdk().is_simulator() else of_the_machine("cl1")
 
     @property
     def now_s(self) -> float:
@@ -176,7 +174,7 @@ class CL1Culture(Culture):
         return {"spikes on ground or reference": self.spikes_not_on_electrodes, "spikes reported late": late}
 
     def _open(self) -> None:
-        cl = _sdk()
+        cl = sdk()
         self.spikes_not_on_electrodes = self.spikes_reported_late = 0
         with as_device_failure("CL1", "open", ": is another program using it?"):
             neurons = self._stack.enter_context(cl.open(take_control=True, wait_until_recordable=True))
@@ -248,12 +246,6 @@ def _remedy(error: Exception, session: Session) -> str:
     if "Timeout waiting for timestamp" not in str(error) or not session.cl.is_simulator():
         return ""
     return "; the simulator did not keep up: run without CL_SDK_ACCELERATED_TIME, or with nothing else running"
-
-
-def _sdk() -> ModuleType:
-    missing = "culture: expected the vendor's package cl-sdk for a cl1, which is not installed"
-    how = f"on Python 3.12 or later {install_command('cl1')} (its licence is CC BY-NC 4.0); on a CL1 it is preinstalled"
-    return vendor_module("cl", f"{missing}: {how}")
 
 
 def _check_patterns(patterns: Patterns) -> Int64[np.ndarray, "patterns size"]:

@@ -9,13 +9,16 @@ from collections import defaultdict, deque
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
+from types import ModuleType
 from typing import Any
 
 import numpy as np
 
+from animat.cultures.failures import vendor_module
 from animat.cultures.observed import Observed, observed_in_frames
 from animat.cultures.safety import Guard
 from animat.errors import DeviceFailed
+from animat.extras import install_command
 from animat.recordings.formats.cl1_layout import CHANNELS, SITES
 from animat.recordings.formats.stimulus_text import parameters_of
 from animat.stimulation.pulse import Pulse
@@ -150,3 +153,10 @@ def _began(stimulus: Stimulus, frame: int, reported: dict[int, deque[int]], star
             raise DeviceFailed(f"CL1: expected {expected}, got none: the device left it out")
         began.append(reported[electrode].popleft())
     return min(began)
+
+
+def sdk(module: str = "cl") -> ModuleType:
+    """The vendor's package, or a part of it; DeviceFailed, with what to do, if it is not installed."""
+    missing = "culture: expected the vendor's package cl-sdk for a cl1, which is not installed"
+    how = f"on Python 3.12 or later {install_command('cl1')} (its licence is CC BY-NC 4.0); on a CL1 it is preinstalled"
+    return vendor_module(module, f"{missing}: {how}")

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32, Float64, Int16
 
-from animat.cultures.devices.cl1_delivery import FRAMES_PER_S
+from animat.cultures.devices.cl1_delivery import FRAMES_PER_S, sdk
 from animat.cultures.tissue import Pulse, Tissue, TissueParameters
 from animat.cultures.virtual import WARM_UP_S
 from animat.cultures.visibility import amplitudes_at_soma_uv
@@ -235,6 +235,4 @@ def use_simulated_culture(**settings: Any) -> None:
 
     The settings are those of `SimulatedCL1`, serialisable as JSON.
     """
-    import cl.sim
-
-    cl.sim.set_simulator_data_source(FACTORY, config=settings, metadata=_metadata())
+    sdk("cl.sim").set_simulator_data_source(FACTORY, config=settings, metadata=_metadata())
