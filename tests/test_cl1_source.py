@@ -144,7 +144,7 @@ def test_settings_that_cannot_be_are_refused(bad: dict[str, float]) -> None:
 
 def test_without_the_sdk_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "cl", None)
-    with pytest.raises(DeviceFailed, match="expected the vendor's package cl-sdk .* pip install"):
+    with pytest.raises(DeviceFailed, match=r"expected the vendor's package cl-sdk .* pip install"):
         cl1_source.use_simulated_culture(seed=1)
 
 
