@@ -109,7 +109,7 @@ ROBOT = {
         "The same policies on the simulator of each recording: median and quartiles over {policies} of "
         "{episodes_over_time} each, with the optimal return. A fall that the optimal return shares is due to "
         "the simulator: to the culture, and to what its bins keep of it. A steeper fall is due to the policy. The "
-        "optimal return at every recording is on a coarse grid, which can lie slightly below the fine one, and is left "
+        "optimal return at every recording is on a coarse grid, which can differ from the fine one, and is left "
         "out for mappings without steps, such as linear.",
         ("tables/{of}-over-time.csv",),
     ),
