@@ -448,7 +448,6 @@ def test_controllability_shows_what_binning_moves_and_what_is_left_out(tmp_path:
         for m, x in (("9-thresholds", 99.0), ("1-threshold", 42.0))
         for at in (0.0, 10.0)
     ]
-    write_typed(optima_file(tmp_path, "cartpole"), ())
     write_typed(optima_file(tmp_path, "cartpole", "over-time"), optima)
     table = controllability_table(study, tmp_path, kept)
     assert table.head[-3:] == ("difference, data", "difference, simulator", "optimum, cartpole")

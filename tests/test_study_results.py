@@ -363,16 +363,6 @@ def test_an_optimum_that_is_known_only_later_is_shown_from_then_on(tmp_path: Pat
     assert panel.optimum is not None
     np.testing.assert_equal(panel.optimum, [np.nan, 20.0])
 
-    # Nor from a grid that is coarser still than one that is too coarse.
-    fine = [replace(row, monte_carlo=150.0, standard_error=1.0) for row in read_optima(tmp_path, "navigation")]
-    write_typed(optima_file(tmp_path, "navigation"), fine)
-    known, coarse = (
-        References(known.study, tmp_path, known.spec, known.table, over_time=over_time) for over_time in (False, True)
-    )
-    (panel,) = _courses(known, coarse, TIMELINE)
-    np.testing.assert_equal(panel.optimum, [np.nan, np.nan])
-    assert panel.fine_optimum == {}
-
 
 def test_lines_of_learning_curves_are_of_the_simulator_in_use(tmp_path: Path) -> None:
     arms = [Arm(str(of).lower(), shadowing=of) for of in (True, False, "drawn")]

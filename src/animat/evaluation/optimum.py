@@ -97,11 +97,6 @@ class Optimum:
         """Whether its own controller returns more, beyond chance: then the value is too low to compare returns with."""
         return any(finding.value is not None and finding.value < 0 for finding in self.findings())
 
-    @property
-    def is_for_scores(self) -> bool:
-        """Whether returns can be compared with it: over all conditions, and not surpassed by its own controller."""
-        return not self.left_out and not self.is_surpassed
-
     def findings(self) -> tuple[Finding, ...]:
         """A warning if the value and its controller's return differ by more than chance and the grid's error."""
         return bracket_findings(self.value, self.grid_error, *self.achieved)

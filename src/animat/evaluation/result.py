@@ -81,12 +81,12 @@ class Evaluation:
         """The normalised score of a row's mean return, (mean - random) / (optimum - random).
 
         None if random actions were not run, if no optimum is known or it is not above them, or if the optimum leaves
-        out conditions that the rows use or is less than its own controller returns. None also for controls in a changed
-        environment, whose optimum is different: with shuffled delivery the choice has no effect, and a silent culture
-        is not the same culture.
+        out conditions that the rows use. None also for controls in a changed environment, whose optimum is different:
+        with shuffled delivery the choice has no effect, and a silent culture is not the same culture. It is too high if
+        the optimum is less than its own controller returns.
         """
         random = next((each for each in self.rows if each.name == "random"), None)
-        if random is None or self.optimum is None or not self.optimum.is_for_scores or row.changed:
+        if random is None or self.optimum is None or self.optimum.left_out or row.changed:
             return None
         mean, at_random, best = float(row.mean_returns.mean()), float(random.mean_returns.mean()), self.optimum.value
         return normalised_score(mean, at_random, best) if best > at_random else None
@@ -174,8 +174,6 @@ class Evaluation:
             return []
         if self.optimum.left_out:
             meaning = "no score, as the optimal return leaves out conditions that the rows use"
-        elif self.optimum.is_surpassed:
-            meaning = "no score, as the optimal return is less than its controller's"
         elif not self.rows[0].changed and self.score(self.rows[0]) is None:
             has_random = any(row.name == "random" for row in self.rows)
             reason = "the optimal return is not above that of" if has_random else "there are no"
@@ -184,5 +182,7 @@ class Evaluation:
             meaning = "score: (mean return - random) / (optimal return - random)"
             if changed := [row.name for row in self.rows if row.changed]:
                 meaning += f"; none for {' and '.join(changed)}, whose optimum is different"
+            if self.optimum.is_surpassed:
+                meaning += "; too high, as the optimal return is less than its controller's"
         lines = [f"  {self.optimum.to_text()}", f"  {meaning}"]
         return [*lines, *context]

@@ -216,6 +216,6 @@ def _context(rows: Sequence[Row], optimum: Optimum | None, largest_return: float
         return None
     returns = by_name["coupling"], by_name["random"]
     if optimum is not None:
-        return context_gap(*returns, optimum) if optimum.is_for_scores else None
+        return None if optimum.left_out or optimum.is_surpassed else context_gap(*returns, optimum)
     agents = [row.episodes.returns for row in rows if row.name in ("policies", "heuristic") and not row.changed]
     return least_context_gap(*returns, np.concatenate(agents), largest_return) if agents else None

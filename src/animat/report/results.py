@@ -49,19 +49,9 @@ class StudyOptimum:
         return Optimum(self.best_return, self.grid_error, timed, its_error, untimed, error, 0, self.nodes or 0)
 
     @property
-    def mapping_kind(self) -> tuple[str, str]:
-        """The mapping, and whose percentiles it has."""
-        return self.mapping, self.percentiles
-
-    @property
     def is_surpassed(self) -> bool:
         """As of `Optimum`."""
         return self.known is not None and self.known.is_surpassed
-
-    @property
-    def is_for_scores(self) -> bool:
-        """Whether returns can be compared with it: over all conditions, and not surpassed by its own controller."""
-        return self.left_out is None and not self.is_surpassed
 
     def findings(self) -> tuple[Finding, ...]:
         """A finding if the value and the better return of its controller differ."""

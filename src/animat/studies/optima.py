@@ -46,17 +46,9 @@ def read_optima(folder: Path, robot: str, what: str = "optima") -> tuple[StudyOp
     return read_typed(optima_file(folder, robot, what), tuple[StudyOptimum, ...])
 
 
-def comparable_optima(optima: Iterable[StudyOptimum]) -> dict[tuple[str, str, float], StudyOptimum]:
-    """The optima of one robot that returns can be compared with, by `key_of`."""
-    return {key_of(optimum, optimum.at_min): optimum for optimum in optima if optimum.is_for_scores}
-
-
-def optima_over_time(folder: Path, robot: str) -> dict[tuple[str, str, float], StudyOptimum]:
-    """The same at every recording, on a coarse grid; none with a mapping for which a finer grid is too coarse."""
-    surpassed = {each.mapping_kind for each in read_optima(folder, robot) if each.is_surpassed}
-    return comparable_optima(
-        each for each in read_optima(folder, robot, "over-time") if each.mapping_kind not in surpassed
-    )
+def complete_optima(optima: Iterable[StudyOptimum]) -> dict[tuple[str, str, float], StudyOptimum]:
+    """The optima of one robot over all conditions, by `key_of`; those over fewer do not apply to the policies."""
+    return {key_of(optimum, optimum.at_min): optimum for optimum in optima if optimum.left_out is None}
 
 
 def key_of(of: Arm | StudyOptimum, at_min: float) -> tuple[str, str, float]:

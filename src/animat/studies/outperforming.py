@@ -11,7 +11,7 @@ from animat.evaluation.statistics import Interval, compare_episodes, is_worse
 from animat.report.results import HeuristicComparison, ReflexComparison, Results, StudyOptimum
 from animat.studies.episodes import COUPLING, POLICY, RANDOM, DataFrame, mean_returns, rows_where
 from animat.studies.evaluating import is_usual
-from animat.studies.optima import comparable_optima, key_of
+from animat.studies.optima import complete_optima, key_of
 from animat.studies.specification import RobotSpec, Study, mapping_label
 
 HEURISTIC = "heuristic"
@@ -63,16 +63,17 @@ def compare_with_reflex(
 ) -> Iterator[ReflexComparison]:
     """Compare each arm that `is_usual` at the minute at which the best coupling was run; `table` is of episodes.
 
-    Without an optimal return that is for scores there is no context gap, and hence no row.
+    Without an optimal return over all conditions, or if its own controller surpasses it, there is no context gap, and
+    hence no row.
     """
     at = rows_where(table, robot=spec.name, over_time=False)
-    known = comparable_optima(each for each in optima if each.robot == spec.name)
+    known = complete_optima(each for each in optima if each.robot == spec.name)
     for arm in filter(is_usual, study.arms):
         controls = rows_where(at, arm=mapping_label(*arm.kind))
         for at_min, coupled in rows_where(controls, agent=COUPLING).groupby("at_min")["return"]:
             best = known.get(key_of(arm, at_min))
             policies = rows_where(at, arm=arm.name, agent=POLICY, at_min=at_min)
-            if best is None or (optimum := best.known) is None:
+            if best is None or best.is_surpassed or (optimum := best.known) is None:
                 continue
             random = rows_where(controls, agent=RANDOM, at_min=at_min)["return"].to_numpy()
             context = context_gap(coupled.to_numpy(), random, optimum)

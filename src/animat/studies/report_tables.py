@@ -11,7 +11,7 @@ from animat.neurons.fidelity import LARGEST_LOSS, Fidelity
 from animat.report.html import Columns, Table, cell, columns_of, table_of, with_error
 from animat.report.results import ComparedReturns, Results, StudyOptimum
 from animat.responses.quality.responses import FEW_SAMPLES
-from animat.studies.optima import key_of, kinds_over_time, optima_over_time
+from animat.studies.optima import complete_optima, key_of, kinds_over_time, read_optima
 from animat.studies.outperforming import NOT
 from animat.studies.specification import Study, mapping_label
 from animat.studies.tabulating import FIRST, LEVEL, SECOND
@@ -22,9 +22,9 @@ _MOST_ROWS = 40
 _SCORE_NOTE = (
     "Optimum: the optimal return of any controller with the same neurons, mapping and robot, by dynamic "
     "programming. Score: (mean − random) / (optimum − random); 0 is as good as random actions, 1 is the optimum, which "
-    "can be exceeded by chance. There is none if the optimum leaves out conditions, or if its own controller returns "
-    "more. A control, whose delivered stimuli are drawn at random, has no optimum: whatever it chooses is as good as "
-    "random."
+    "can be exceeded by chance. Scores are too high where the optimum's own controller returns more than it (“Optimal "
+    "returns”). A control, whose delivered stimuli are drawn at random, has no optimum: whatever it chooses is as good "
+    "as random."
 )
 
 
@@ -87,7 +87,7 @@ def optima_table(optima: Sequence[StudyOptimum]) -> Table:
         "Run: the mean return of the controller that takes the best actions, on the robot itself, ± its standard "
         "error: a return that is achievable. The optimal return lies between the two; scores use the value, the upper "
         "end. Highlighted: the two differ by more than 3 standard errors and the grid's error. If the controller "
-        "returns more, the grid is too coarse, and there are no scores. Without clock: the same controller without "
+        "returns more, the grid is too coarse, and scores are too high. Without clock: the same controller without "
         "knowledge of the time left, which policies do not have either. Optima at every recording, on a coarse grid, "
         "are in optima/."
     )
@@ -106,7 +106,7 @@ def controllability_table(study: Study, folder: Path, kept: Mapping[float, Fidel
     """How often each condition exceeds the median in every recording, in the data and in the simulator."""
     kind = next(iter(kinds_over_time(study)), None)
     names = [spec.name for spec in study.robots] if kind else []
-    optima = {name: optima_over_time(folder, name) for name in names}
+    optima = {name: complete_optima(read_optima(folder, name, "over-time")) for name in names}
     labels = next(iter(kept.values())).labels
     rows, marked = [], []
     for i, (at_min, of) in enumerate(kept.items()):

@@ -20,14 +20,7 @@ from animat.report.results import TRAINED, ComparedReturns, ControlReturns, Resu
 from animat.studies.episodes import POLICY, RANDOM, DataFrame, goals_met, mean_returns, read_episodes, rows_where
 from animat.studies.evaluating import as_recorded, policies_of
 from animat.studies.folder import RESULTS, controls_file, episodes_file, table_file
-from animat.studies.optima import (
-    comparable_optima,
-    key_of,
-    kinds_of,
-    missing_capabilities,
-    optima_over_time,
-    read_optima,
-)
+from animat.studies.optima import complete_optima, key_of, kinds_of, missing_capabilities, read_optima
 from animat.studies.outperforming import compare_with_heuristic, compare_with_reflex
 from animat.studies.paper import PRINTED
 from animat.studies.recording import controllability
@@ -113,8 +106,7 @@ class References:
         self, study: Study, folder: Path, spec: RobotSpec, table: DataFrame, *, over_time: bool = False
     ) -> None:
         self.study, self.folder, self.spec, self.table = study, folder, spec, table
-        name = spec.name
-        self._optima = optima_over_time(folder, name) if over_time else comparable_optima(read_optima(folder, name))
+        self._optima = complete_optima(read_optima(folder, spec.name, "over-time" if over_time else "optima"))
         random = rows_where(table, robot=spec.name, agent=RANDOM, over_time=over_time)
         self._random: dict[tuple[str, str, float], float] = {}
         for kind in kinds_of(study):
@@ -126,7 +118,7 @@ class References:
         return self._random.get(key_of(arm, at_min))
 
     def optimum(self, arm: Arm, at_min: float) -> StudyOptimum | None:
-        """The optimum; None for the control, which has none, and where it is not for scores."""
+        """The optimum; None for the control, which has none, and where it leaves out conditions."""
         return None if arm.delivery == "shuffled" else self._optima.get(key_of(arm, at_min))
 
     def best_return(self, arm: Arm, at_min: float) -> float | None:
