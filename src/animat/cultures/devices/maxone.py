@@ -21,7 +21,7 @@ from animat.cultures.failures import as_device_failure, describe_error, once_ope
 from animat.cultures.holding import of_the_machine
 from animat.cultures.observed import Observed, observed_in_frames
 from animat.cultures.safety import Admitted, Guard, History, Limits
-from animat.errors import DeviceFailed, InvalidArgument
+from animat.errors import DeviceFailed, InvalidArgument, expect_kind
 from animat.recordings.recorded_culture import RecordedCulture
 from animat.recordings.recording import Channels
 from animat.stimulation.selection import Selection
@@ -90,12 +90,14 @@ class MaxOneCulture(Culture):
         limits: Limits | None = None,
     ) -> None:
         super().__init__(limits)
+        expect_kind("selection", selection, Selection, "a selection, as animat.Selection.load returns")
         array = selection.array
         if (array.columns, array.rows) != (220, 120):
             raise InvalidArgument(f"selection: expected one on a MaxOne, got one on a {array.name}")
-        if not len(selection.recording) or not 1 <= len(selection.stimulation) <= array.stimulation_units:
-            expected = f"recording sites and 1 to {array.stimulation_units} stimulation sites"
-            got = f"{len(selection.recording)} and {len(selection.stimulation)}"
+        recording, stimulation = len(selection.recording), len(selection.stimulation)
+        if not (1 <= recording <= array.channels and 1 <= stimulation <= array.stimulation_units):
+            expected = f"1 to {array.channels:,} recording and 1 to {array.stimulation_units} stimulation sites"
+            got = f"{recording:,} and {stimulation:,}"
             raise InvalidArgument(f"selection: expected {expected}, got {got}")
         if not 0 < sequence_s <= 60:
             raise InvalidArgument(f"sequence_s: expected above 0 to 60 s, got {sequence_s}")
