@@ -376,9 +376,9 @@ def test_a_selection_that_cannot_be_is_refused() -> None:
     with pytest.raises(InvalidArgument, match="1 to 32 stimulation sites, got 132 and 33"):
         MaxOneCulture(selection(sites=[*SITES, 26_000]))
     many = Selection(MAXONE, np.arange(1025), np.array([1]), np.array([[1]]))
-    with pytest.raises(InvalidArgument, match="expected 1 to 1,024 recording .* sites, got 1,025 and 1"):
+    with pytest.raises(InvalidArgument, match=r"expected 1 to 1,024 recording .* sites, got 1,025 and 1"):
         MaxOneCulture(many)
-    with pytest.raises(InvalidArgument, match="selection: expected a selection, .*, got 'selection.json'"):
+    with pytest.raises(InvalidArgument, match=r"selection: expected a selection, .*, got 'selection.json'"):
         MaxOneCulture("selection.json")  # type: ignore[arg-type]
     with pytest.raises(InvalidArgument, match="expected one on a MaxOne, got one on a CL1"):
         MaxOneCulture(_on_another_array())
