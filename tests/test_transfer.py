@@ -54,7 +54,7 @@ def a_recording(start_min: float, order: str = "mixed", *, memory: bool = False)
 
 
 def ran(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict[str, Any]:
-    """A command's line of JSON, in which everything is that it warns of."""
+    """A command's line of JSON, which has everything that it warns of."""
     assert main([*arguments, "--json"]) == 0
     said = capsys.readouterr()
     found: dict[str, Any] = json.loads(said.out.splitlines()[-1])

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from animat.errors import InvalidArgument, InvalidFile, LoopEnded, Mismatch, expect_at_least
 from animat.process import own_cores
-from animat.recordings.findings import Finding, warnings_once
+from animat.recordings.findings import Finding, warnings_once, without_notes
 
 if TYPE_CHECKING:
     from animat.closed_loop.session import Session
@@ -247,7 +247,7 @@ def simulator_settings(
 
 def warnings_of(timeline: SimulatorTimeline | None) -> tuple[Finding, ...]:
     """What was printed about the simulators' recordings, for JSON."""
-    return () if timeline is None else tuple(each for each in timeline.findings if each.severity != "note")
+    return () if timeline is None else without_notes(timeline.findings)
 
 
 def print_warnings(findings: Sequence[Finding]) -> None:

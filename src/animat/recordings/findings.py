@@ -77,12 +77,16 @@ def merged(findings: Iterable[Finding]) -> tuple[Finding, ...]:
     return tuple(kept.values())
 
 
+def without_notes(findings: Iterable[Finding]) -> tuple[Finding, ...]:
+    """Those that are warnings, or refuse what they are about."""
+    return tuple(finding for finding in findings if finding.severity != "note")
+
+
 def warnings_once(findings: Sequence[Finding]) -> Iterator[str]:
     """Name and message of all but notes; if several recordings have the same one, its worst, with how many others."""
     warnings: dict[str, list[Finding]] = {}
-    for finding in findings:
-        if finding.severity != "note":
-            warnings.setdefault(finding.name, []).append(finding)
+    for finding in without_notes(findings):
+        warnings.setdefault(finding.name, []).append(finding)
     for name, same in warnings.items():
         # The value farthest from 0, or the nearest where small values are bad.
         sizes = [abs(finding.value or 0.0) for finding in same]

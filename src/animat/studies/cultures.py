@@ -24,7 +24,7 @@ from animat.execution.pinned import PinnedProcesses
 from animat.folders import expect_no_other
 from animat.process import own_cores
 from animat.progress import Progress, Silent
-from animat.recordings.findings import Finding
+from animat.recordings.findings import Finding, without_notes
 from animat.report.html import Columns, Section, cell, columns_of, picture_of, table_of, write_page
 from animat.report.results import ComparedReturns, OverCultures, Results, Score
 from animat.report.returns import draw_over_cultures
@@ -101,10 +101,9 @@ def run_over_cultures(
     expect_no_other(folder, "cultures")
     for name, each in studies.items():
         expect_same_specification(each, folder / name)
-    for other in sorted(
-        {path.parent for path in folder.glob(f"culture-*/{STUDY}")} - {folder / name for name in studies}
-    ):
-        expect_same_specification(study, other, of_culture=False)
+    for path in sorted(folder.glob(f"culture-*/{STUDY}")):
+        if path.parent.name not in studies:
+            expect_same_specification(study, path.parent, of_culture=False)
     with exclusive_lock(folder):
         _write_manifest(folder, studies, {})
         with _choose_executor(workers, executor) as (shared, at_once):
@@ -125,10 +124,7 @@ def run_over_cultures(
         write_records(folder / SUMMARY, OverCultures, summary)
         write_of_cultures(folder / SCORES, Score, scores)
         parquet = write_parquet((folder / SCORES).with_suffix(".parquet"), Score, scores)
-    warnings = {
-        name: tuple(finding for finding in each.findings if finding.severity != "note")
-        for name, each in results.items()
-    }
+    warnings = {name: without_notes(each.findings) for name, each in results.items()}
     heuristic = tuple(not_outperforming_over(results.values()))
     return CulturesRun(folder, finished, failed, comparisons, summary, parquet, warnings, heuristic)
 

@@ -149,7 +149,7 @@ def expect_same_specification(study: Study, folder: Path, *, of_culture: bool = 
     if found is None:
         return
     described, there = json.loads(json.dumps(asdict(study))), found.get("study")
-    if not of_culture and isinstance(there, dict):
+    if not of_culture and isinstance(there, dict) and isinstance(there.get("culture"), dict):
         described["culture"] |= {name: there["culture"].get(name) for name in ("seed", "seeds", "files", "folders")}
     if there != described:
         _expect_replaceable(folder, "study", found, found | {"study": described}, [MANIFEST, SPECIFICATION])

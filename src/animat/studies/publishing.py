@@ -12,6 +12,7 @@ from animat.errors import counted
 from animat.neurons.fidelity import Fidelity
 from animat.neurons.timeline import load_timeline
 from animat.progress import Progress
+from animat.recordings.findings import without_notes
 from animat.report.html import Picture, Section, Table, cell, picture_of, write_page
 from animat.report.results import ComparedReturns, ControlReturns, Results, Score
 from animat.report.returns import draw_headline
@@ -279,7 +280,7 @@ def _differences(study: Study, results: Results, kept: dict[float, Fidelity], se
 
 def _findings(results: Results) -> Section:
     file = "tables/findings.csv"
-    warnings = tuple((finding.name, finding.message) for finding in results.findings if finding.severity != "note")
+    warnings = tuple((finding.name, finding.message) for finding in without_notes(results.findings))
     counts = (
         f"{counted(len(warnings), 'warning')} and {counted(len(results.findings) - len(warnings), 'note')} on the "
         f"recordings, the simulators made from them and the optima; all are in {file}."
