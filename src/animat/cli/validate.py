@@ -37,7 +37,7 @@ class Validate(ResponseOptions):
         from animat.recordings.reading import list_recordings, read_source
         from animat.report.inspection import expect_unique_stems, figure_stem
         from animat.report.style import save_figure
-        from animat.report.validation import correlations_text, draw_validation, validation_text
+        from animat.report.validation import COLUMNS, correlations_text, draw_validation, validation_text
         from animat.responses.conditions import conditions_named
         from animat.responses.extraction import extract_series
         from animat.responses.readouts import read_readouts
@@ -81,4 +81,5 @@ class Validate(ResponseOptions):
                     matrix = correlations(responses)
                     print(correlations_text(responses.readouts.names, matrix), end="\n\n")
                     validated[-1]["correlations"] = matrix.tolist()
+        print(COLUMNS)
         return {"recordings": validated}

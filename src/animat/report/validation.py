@@ -16,6 +16,12 @@ from animat.neurons.validation import FREE_RUNS, MARGINAL, PIT_BINS, Band, Valid
 from animat.report.colours import BLACK, BLUE, GREEN, GREY, ORANGE
 from animat.report.style import add_common_legend, new_figure, style_axes
 
+COLUMNS = """\
+marginal: all conditions pooled; bits, CRPS: of the held-out responses, more bits and a smaller CRPS are better
+off by: the largest error of the predicted distribution, 0 to 1, and its p by chance
+lag 1: the correlation of successive responses; run length: of runs at or above the median, in trials"""
+"""What the rows and columns of `validation_text` are."""
+
 _COLOURS = {MARGINAL: GREY, "histogram": ORANGE, "empirical": GREEN, "memory": BLUE}
 
 
