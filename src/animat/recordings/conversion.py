@@ -20,7 +20,7 @@ from animat.recordings.findings import Finding, merged
 from animat.recordings.formats.hdf5_formats import open_traces
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.formats.with_spikeinterface import open_with_spikeinterface
-from animat.recordings.metadata import culture_of, date_of
+from animat.recordings.metadata import LIKE_A_DATE, culture_of, date_of
 from animat.recordings.raw import RawTraces
 from animat.recordings.reading import HDF5, TEXT_NAMES, ZIP, first_bytes, read_recording
 from animat.recordings.recording import Recording
@@ -31,8 +31,8 @@ DURATION = re.compile(rf"P(?=.){_DATE}(?:T(?=\d){_TIME})?", re.ASCII)
 DAY_S = 86_400.0
 UNITS_S = (365.25 * DAY_S, 365.25 / 12 * DAY_S, 7 * DAY_S, DAY_S, 3600.0, 60.0, 1.0)
 """The length of each of these, with mean years and months."""
-PERSONS = re.compile(r"\s*[^,;]+,\s*[^,;]+(?:;\s*[^,;]+,\s*[^,;]+)*")
-SPECIES = re.compile(r"[A-Z][a-z]*\.?( [a-z]+){1,2}|https?://\S+/NCBITaxon_\d+")
+PERSONS = re.compile(r"\s*[^,;]+,\s*[^,;]+(?:;\s*[^,;]+,\s*[^,;]+)*").fullmatch
+SPECIES = re.compile(r"[A-Z][a-z]*\.?( [a-z]+){1,2}|https?://\S+/NCBITaxon_\d+").fullmatch
 """Genus, species and optionally subspecies, or an address in NCBI's taxonomy."""
 
 
@@ -69,19 +69,13 @@ class Origin:
 
     def __post_init__(self) -> None:
         # Checked here rather than when the file is written, as spike detection takes minutes.
-        checks: dict[str, tuple[Callable[[str], object], str]] = {
-            "species": (
-                SPECIES.fullmatch,
-                "the name in Latin, such as Mus musculus, or its address in NCBI's taxonomy",
-            ),
-            "age": (_lengths_s, "an ISO 8601 duration such as P42D (days), P6W or P3M"),
-            "experimenter": (PERSONS.fullmatch, "Last, First, several separated by semicolons"),
-            "recorded_at": (
-                lambda text: date_of({"recorded_at": text}),
-                "an ISO 8601 date such as 2024-05-31T14:00:00+09:00",
-            ),
-        }
-        for name, (read, expected) in checks.items():
+        checks: tuple[tuple[str, Callable[[str], object], str], ...] = (
+            ("species", SPECIES, "the name in Latin, such as Mus musculus, or its address in NCBI's taxonomy"),
+            ("age", _lengths_s, "an ISO 8601 duration such as P42D (days), P6W or P3M"),
+            ("experimenter", PERSONS, "Last, First, several separated by semicolons"),
+            ("recorded_at", lambda text: date_of({"recorded_at": text}), LIKE_A_DATE),
+        )
+        for name, read, expected in checks:
             if (text := getattr(self, name)) is not None and not read(text):
                 raise InvalidArgument(f"{name}: expected {expected}, got {text!r}")
         if self.age is not None and (lengths_s := _lengths_s(self.age)) != sorted(lengths_s):

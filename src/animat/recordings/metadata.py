@@ -16,6 +16,7 @@ from animat.records import json_data, read_record
 from animat.stimulation.protocol import Protocol
 from animat.stimulation.pulse import Pulse
 
+LIKE_A_DATE = "an ISO 8601 date such as 2024-05-31T14:00:00+09:00"
 _VALUES = "values of findings"
 """The key of the findings' values, as JSON by the keys of their messages."""
 _LOOP_PULSE = "closed_loop_pulse"

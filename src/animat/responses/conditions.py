@@ -11,9 +11,8 @@ from jaxtyping import Int64
 
 from animat.errors import InvalidArgument, expect_kind, within
 from animat.responses.condition import RESTING, Condition, brief_labels
-from animat.stimulation.frequency import distinct, is_same
 from animat.stimulation.protocol import Protocol
-from animat.stimulation.stimulus import NOTHING, Stimuli
+from animat.stimulation.stimulus import NOTHING, Stimuli, distinct, is_same
 from animat.tables import UNKNOWN
 
 NO_CONDITION = -1
@@ -212,12 +211,10 @@ def conditions_named(text: str) -> Conditions:
     """
     expect_kind("conditions", text, str, "text such as 'frequency:5,10'")
     with within("conditions"):
-        parts = [_parse(part) for part in text.split(" x ")]
-        if len(parts) == 1:
-            return parts[0]
-        if len(parts) == 2:
-            when, where = parts
-            if isinstance(when, ByFrequency | ByInterval) and isinstance(where, ByElectrode | ByPattern):
+        match [_parse(part) for part in text.split(" x ")]:
+            case [one]:
+                return one
+            case [ByFrequency() | ByInterval() as when, ByElectrode() | ByPattern() as where]:
                 return ByBoth(when, where)
         raise _invalid(text, "frequency or interval before x, and electrode or pattern after it")
 

@@ -163,7 +163,7 @@ def _hz_per_unit(table: ResponseTable, window_ms: Window) -> float:
 
 def _blocks(source: Recording | ResponseTable) -> tuple[Bool[np.ndarray, " stimuli"], float]:
     """Whether a block begins with each stimulus, and the set-up before it, which the recording's clock leaves out."""
-    protocol, stimuli = source.protocol if isinstance(source, Recording) else None, source.stimuli
+    protocol, stimuli = source.protocol, source.stimuli
     if protocol is None or protocol.order != "blocked":
         return np.zeros(len(stimuli), bool), 0.0
     trial = np.cumsum(np.diff(stimuli.presentation, prepend=-2) != 0) - 1

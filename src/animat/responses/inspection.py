@@ -43,9 +43,6 @@ class ConditionSummary(NamedTuple):
     share_above_median: float
 
 
-_SUMMARY_KEYS = ("label", "responses", "non_burst", "median_rate_hz", "share_above_median")
-
-
 @dataclass(frozen=True, eq=False)
 class Inspection:
     """The contents and findings of one recording.
@@ -106,6 +103,7 @@ class Inspection:
     def to_dict(self) -> dict[str, Any]:
         """Everything as plain data for JSON; unknown values are None."""
         responses, bursts = self.responses, self.network_bursts
+        of_condition = ("label", "responses", "non_burst", "median_rate_hz", "share_above_median")
         data = {
             "name": self.name,
             "verdict": self.verdict,
@@ -130,7 +128,7 @@ class Inspection:
             "network_bursts": None
             if bursts is None
             else {"bursts": len(bursts), "median_s": bursts.median_s, "share_of_spikes": bursts.share},
-            "conditions": [dict(zip(_SUMMARY_KEYS, summary, strict=True)) for summary in self.conditions],
+            "conditions": [dict(zip(of_condition, each, strict=True)) for each in self.conditions],
             "findings": [{**finding.to_dict(), "value": finding.value} for finding in self.findings],
         }
         return as_json(data)  # type: ignore[no-any-return]

@@ -121,16 +121,12 @@ class Responses:
                 raise Mismatch(f"responses.readout_hz: expected shape {expected}, got {got}")
         if (self.presented is None) != (self.place is None):
             raise Mismatch("responses.presented, responses.place: expected both or neither, got one")
-        if self.presented is not None:
-            n = len(self.presented.condition)
-            self._expect_within("place", n, f"rows from 0 to {n - 1}")
-        n = len(self.conditions)
-        self._expect_within("condition", n, f"indices of {n} conditions")
-
-    def _expect_within(self, name: str, n: int, words: str) -> None:
-        index = getattr(self, name)
-        if len(index) and not (index.min() >= 0 and index.max() < n):
-            raise Mismatch(f"responses.{name}: expected {words}, got {index.min()} to {index.max()}")
+        n, trials = len(self.conditions), 0 if self.presented is None else len(self.presented.condition)
+        bounds = (("place", trials, f"rows from 0 to {trials - 1}"), ("condition", n, f"indices of {n} conditions"))
+        for name, end, words in bounds:
+            index = getattr(self, name)
+            if index is not None and len(index) and not (index.min() >= 0 and index.max() < end):
+                raise Mismatch(f"responses.{name}: expected {words}, got {index.min()} to {index.max()}")
 
     def __len__(self) -> int:
         return len(self.condition)
@@ -236,8 +232,7 @@ class Responses:
         """Some of the responses; their history is kept."""
         presented, place = self.presentations
         names = ("condition", "rate_hz", "active_ratio", "is_burst", "time_s", "readout_hz")
-        known = {name: column for name in names if (column := getattr(self, name)) is not None}
-        columns: dict[str, Any] = {name: column[rows] for name, column in known.items()}
+        columns: dict[str, Any] = {name: of[rows] for name in names if (of := getattr(self, name)) is not None}
         return replace(self, **columns, presented=presented, place=place[rows])
 
     def shares_above_median(self) -> Float64[np.ndarray, " conditions"]:

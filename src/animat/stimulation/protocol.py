@@ -14,17 +14,15 @@ from animat.arguments import checked_arguments
 from animat.errors import InvalidArgument, in_file
 from animat.plain_file import read_plain_text
 from animat.records import Number, Whole, json_data, record
-from animat.stimulation.frequency import distinct
 from animat.stimulation.places import NONE, Places, check_places, count_places
 from animat.stimulation.pulse import PUBLISHED_PULSE, Pulse
+from animat.stimulation.stimulus import distinct
 
 Order = Literal["blocked", "mixed"]
 
 _MOST_PULSES = 10_000_000
 _LONGEST_RECORDING_S = 7 * 86_400
 _MOST_BYTES = 2**20
-_FORMER = {"presentations": "trials"}
-"""Former names of a protocol's attributes, still read from older files."""
 
 Count = Annotated[Whole, Field(ge=1, le=1_000_000)]
 Pulses = Annotated[Whole, Field(ge=1, le=_MOST_PULSES)]
@@ -150,8 +148,9 @@ class Protocol:
         if not isinstance(data, dict) or (defaults is None and "pulse" not in data):
             needed = ', such as {"frequencies_hz": [5, 10]}' if defaults else ", with a pulse"
             raise InvalidArgument(f"protocol: expected what Protocol.to_json writes{needed}, got {text.strip()[:80]!r}")
-        if "trials" not in data:
-            data = {_FORMER.get(name, name): value for name, value in data.items()}
+        if "presentations" in data and "trials" not in data:
+            # Older files have this name.
+            data["trials"] = data.pop("presentations")
         return replace(defaults or PAPER, **data)
 
 

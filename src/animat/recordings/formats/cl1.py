@@ -51,7 +51,12 @@ def read_cl1(file: Hdf5File, *, spikes: bool = True) -> Recording:
     electrodes = np.array(SITES if n_channels == CHANNELS else range(n_channels), dtype=np.int64)
     stimulus_frame, columns = _stimuli(file)
     columns |= _parameters(file, stimulus_frame, findings)
-    start = _first_frame(file, frame, stimulus_frame)
+    # Frames count from 0, or from the start of the rig. Which one is stated by a pickle, which is not opened; so it is
+    # inferred: none lies before the start, and the last one beyond the number of frames.
+    start, frames = file.attribute("/", "start_timestamp"), file.attribute("/", "duration_frames")
+    every = np.concatenate([frame, stimulus_frame])
+    is_stated = isinstance(start, int) and isinstance(frames, int) and 0 < frames < every.max(initial=0)
+    start = start if is_stated and every.min() >= start else 0
     on_electrode = np.isin(channel, electrodes)
     if stray := int(np.count_nonzero(~on_electrode)):
         strays = np.unique(channel[~on_electrode]).tolist()
@@ -59,7 +64,6 @@ def read_cl1(file: Hdf5File, *, spikes: bool = True) -> Recording:
         message = f"{stray:,} of {len(channel):,} spikes are on channels {names}, which are no electrodes: left out"
         findings.append(Finding("spikes-not-on-electrodes", "note", message, float(stray)))
     spike_time_s, stimulus_time_s = (frame[on_electrode] - start) / rate_hz, (stimulus_frame - start) / rate_hz
-    frames = file.attribute("/", "duration_frames")
     if isinstance(frames, int) and frames > 0:
         columns |= recorded_span(frames, rate_hz, spike_time_s, stimulus_time_s)
     provenance = {"source": file.path.name, "format": "CL1"}
@@ -70,18 +74,6 @@ def read_cl1(file: Hdf5File, *, spikes: bool = True) -> Recording:
     columns |= {"channel_label": electrodes, "channel_electrode": electrodes, "sampling_rate_hz": rate_hz}
     plain = PlainColumns(spike_time_s, channel[on_electrode], stimulus_time_s, **columns)
     return plain.to_recording(provenance, tuple(findings))
-
-
-def _first_frame(file: Hdf5File, spike: Column, stimulus: Column) -> int:
-    """The frame of time 0: 0, or the recording's first frame if frames count from the start of the rig.
-
-    Which one is stated by a pickle, which is not opened; so it is inferred: none lies before the start, and the last
-    one beyond the number of frames.
-    """
-    start, frames = file.attribute("/", "start_timestamp"), file.attribute("/", "duration_frames")
-    every = np.concatenate([spike, stimulus])
-    is_stated = isinstance(start, int) and isinstance(frames, int) and 0 < frames < every.max(initial=0)
-    return start if is_stated and every.min() >= start else 0
 
 
 def _stimuli(file: Hdf5File) -> tuple[Column, dict[str, Any]]:

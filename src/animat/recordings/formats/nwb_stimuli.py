@@ -43,7 +43,10 @@ def read_stimuli(file: Hdf5File, asked: str | None, findings: list[Finding]) -> 
     at = _find_stimuli(file, asked, findings)
     if at is None:
         return {"stimulus_time_s": np.empty(0)}
-    times = _times_column(file, at)
+    # The column of a table of events, or of intervals; a series has none.
+    times = "timestamp" if file.has(f"{at}/timestamp") else None
+    if times is None and file.has(f"{at}/start_time"):
+        times = _onset_column(file, at) or "start_time"
     columns = {"stimulus_time_s": _from_series(file, at)} if times is None else _from_table(file, at, times, findings)
     n_rows, source = len(columns["stimulus_time_s"]), at
     if times not in (None, "start_time"):
@@ -82,13 +85,6 @@ def _can_be_stimuli(file: Hdf5File, at: str) -> bool:
     if file.attribute(at, "neurodata_type") in ("ElectricalSeries", "LFP", "SpikeEventSeries"):
         return False
     return any(file.has(f"{at}/{name}") for name in ("start_time", "timestamp", "timestamps", "starting_time"))
-
-
-def _times_column(file: Hdf5File, at: str) -> str | None:
-    """The column of a table with the times of the stimuli: of events or of intervals; None for a series."""
-    if file.has(f"{at}/timestamp"):
-        return "timestamp"
-    return (_onset_column(file, at) or "start_time") if file.has(f"{at}/start_time") else None
 
 
 def _onset_column(file: Hdf5File, at: str) -> str | None:

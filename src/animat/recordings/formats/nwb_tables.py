@@ -18,7 +18,7 @@ from pynwb.misc import Units
 
 from animat.errors import InvalidArgument
 from animat.recordings.formats.nwb_layout import FORMAT_VERSION, SUBJECT
-from animat.recordings.metadata import date_of, to_metadata
+from animat.recordings.metadata import LIKE_A_DATE, date_of, to_metadata
 from animat.recordings.recorded_culture import UNKNOWN_SUBJECT_ID
 from animat.recordings.recording import Channels, Recording
 from animat.stimulation.stimulus import NOTHING, Stimuli
@@ -42,8 +42,8 @@ def nwb_file(recording: Recording, spike_counts: Int64[np.ndarray, " channels"])
     texts = {_text("provenance", k): _text("provenance", v) for k, v in to_metadata(recording).items()}
     date = date_of(texts) if "recorded_at" in texts else UNKNOWN_DATE
     if date is None:
-        expected, got = "an ISO 8601 date such as 2024-05-31T14:00:00+09:00", texts["recorded_at"]
-        raise InvalidArgument(f"provenance['recorded_at']: expected {expected}, got {got!r}")
+        got = texts["recorded_at"]
+        raise InvalidArgument(f"provenance['recorded_at']: expected {LIKE_A_DATE}, got {got!r}")
     nwb = NWBFile(
         session_description=texts.get(
             "session_description", "Spikes of a neuronal culture on a multi-electrode array, under stimulation."

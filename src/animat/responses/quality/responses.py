@@ -150,8 +150,20 @@ def _timing(
         yield Finding("dead-window", "refuse", message, spikes / expected if expected else 0.0)
         return
     yield from _dead_conditions(responses, recording, assignment, per_stimulus)
-    if response is not None:
-        yield from _window_findings(response, start_ms, end_ms)
+    if response is None:
+        return
+    if response.start_ms >= end_ms or response.end_ms <= start_ms:
+        message = (
+            f"the response is at {response} after a stimulus, outside the {window}: "
+            f"use --window-ms {response.start_ms:g} {response.end_ms:g}"
+        )
+        yield Finding("response-elsewhere", "warning", message, response.start_ms)
+    else:
+        message = (
+            f"the culture fires above its spontaneous rate from {response} after a stimulus; the window is "
+            f"{start_ms:g} to {end_ms:g} ms"
+        )
+        yield Finding("response-time", "note", message, response.start_ms)
 
 
 def _overlapping(stimuli: Stimuli, end_ms: float) -> Iterator[Finding]:
@@ -168,22 +180,6 @@ def _overlapping(stimuli: Stimuli, end_ms: float) -> Iterator[Finding]:
             f"at {end_ms:g} ms, so its artefact and response are counted in theirs: use a shorter window"
         )
         yield Finding("stimuli-too-close", "warning", message, float(overlapping))
-
-
-def _window_findings(response: ResponseTime, start_ms: float, end_ms: float) -> Iterator[Finding]:
-    """A finding on when the response comes, within the window or outside."""
-    if response.start_ms >= end_ms or response.end_ms <= start_ms:
-        message = (
-            f"the response is at {response} after a stimulus, outside the window from {start_ms:g} to {end_ms:g} ms: "
-            f"use --window-ms {response.start_ms:g} {response.end_ms:g}"
-        )
-        yield Finding("response-elsewhere", "warning", message, response.start_ms)
-    else:
-        message = (
-            f"the culture fires above its spontaneous rate from {response} after a stimulus; the window is "
-            f"{start_ms:g} to {end_ms:g} ms"
-        )
-        yield Finding("response-time", "note", message, response.start_ms)
 
 
 def _spikes_in_window(
@@ -228,12 +224,9 @@ def _conditions(responses: Responses) -> Iterator[Finding]:
         n_all = int(np.count_nonzero(responses.condition == i))
         n = len(responses.rates_of(i))
         if not n:
-            none = "no stimulus whose response window lies in the recording"
-            what = (
-                f"only bursts, after {counted(n_all, 'stimulus', 'stimuli')} (--burst-threshold 1 keeps them)"
-                if n_all
-                else none
-            )
+            what = "no stimulus whose response window lies in the recording"
+            if n_all:
+                what = f"only bursts, after {counted(n_all, 'stimulus', 'stimuli')} (--burst-threshold 1 keeps them)"
             message = f"condition {condition.label}: {what}; leave it out or choose other conditions (--conditions)"
             yield Finding("empty-condition", "refuse", message, 0.0)
         elif n < FEW_SAMPLES:
