@@ -54,12 +54,9 @@ def placed_by_date(series: Sequence[D]) -> list[D]:
     if len(set(starts_min)) == len(series) and not was_restarted:
         return list(series)
     listed = ", ".join(map(in_min, sorted(placed_min)))
-    why = (
-        "the device's clock was restarted between recordings"
-        if was_restarted
-        else "some recordings start at the same minute"
-    )
-    message = f"{why}, so all are placed by their dates: at {listed}"
-    note = Finding("placed-by-date", "note", message)
+    why = "some recordings start at the same minute"
+    if was_restarted:
+        why = "the device's clock was restarted between recordings"
+    note = Finding("placed-by-date", "note", f"{why}, so all are placed by their dates: at {listed}")
     changed: list[Any] = list(zip(series, placed_min, strict=True))
     return [dataclasses.replace(each, start_min=at, findings=(*each.findings, note)) for each, at in changed]

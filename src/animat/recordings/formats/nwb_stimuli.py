@@ -167,9 +167,14 @@ def _electrodes(file: Hdf5File, at: str, n: int) -> Column | None:
         return None
     values = file.read(at).astype(np.int64)
     if file.attribute(at, "neurodata_type") == "DynamicTableRegion":
-        if (numbers := _electrodes_in_rows(file, at, values)) is None:
+        # Rows of the electrodes table, or of another table, whose electrodes are not known.
+        table, to = file.node(ELECTRODES), dataset.attrs.get("table")
+        if not isinstance(to, h5py.Reference) or not to or table is None or file.file[to] != table:
             return None
-        values = numbers
+        numbers = file.read(f"{ELECTRODES}/id").astype(np.int64).reshape(-1)
+        if np.any((values < 0) | (values >= len(numbers))):
+            return None
+        values = numbers[values]
     if file.has(f"{at}_index"):
         ends = [0, *file.read(f"{at}_index").astype(np.int64).reshape(-1).tolist()]
         # Stimuli are not refused for an index that does not fit: their electrodes are then unknown.
@@ -178,18 +183,6 @@ def _electrodes(file: Hdf5File, at: str, n: int) -> Column | None:
         flat = values.reshape(-1).tolist()
         return padded([flat[start:end] for start, end in pairwise(ends)])
     return values if values.shape[:1] == (n,) and values.ndim <= 2 else None
-
-
-def _electrodes_in_rows(file: Hdf5File, at: str, rows: Column) -> Column | None:
-    """The electrodes in rows of the electrodes table that a column refers to; None for those of another table."""
-    table, column = file.node(ELECTRODES), file.dataset(at)
-    to = column.attrs.get("table")
-    if not isinstance(to, h5py.Reference) or not to or table is None or file.file[to] != table:
-        return None
-    numbers = file.read(f"{ELECTRODES}/id").astype(np.int64).reshape(-1)
-    if np.any((rows < 0) | (rows >= len(numbers))):
-        return None
-    return numbers[rows]
 
 
 def _from_series(file: Hdf5File, at: str) -> Column:

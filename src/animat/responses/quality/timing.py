@@ -13,6 +13,9 @@ from animat.recordings.recording import Recording
 from animat.responses.psth import PostStimulusHistogram, post_stimulus_histogram, spontaneous_rate
 from animat.responses.windows import Window
 
+Bins = Bool[np.ndarray, " bins"]
+Times = Float64[np.ndarray, " times"]
+
 BIN_MS = 0.5
 SPAN_MS = (-10.0, 20.0)
 LOOKED_AT_MS = (-2.0, 10.0)
@@ -93,12 +96,8 @@ def artefact_findings(recording: Recording, window_ms: Window, *, is_elsewhere: 
 
 
 def _artefact(
-    histogram: PostStimulusHistogram,
-    usual: float,
-    spontaneous: float,
-    spike_times_s: Float64[np.ndarray, " spikes"],
-    stimulus_s: Float64[np.ndarray, " stimuli"],
-) -> Bool[np.ndarray, " bins"]:
+    histogram: PostStimulusHistogram, usual: float, spontaneous: float, spike_times_s: Times, stimulus_s: Times
+) -> Bins:
     edges_ms, count = histogram.edges_ms, histogram.count
     from_ms = edges_ms[:-1]
     above = (count > TIMES * usual) & (from_ms >= LOOKED_AT_MS[0]) & (from_ms < LOOKED_AT_MS[1])
@@ -123,7 +122,7 @@ def _artefact(
     return np.zeros(len(count), np.bool_)
 
 
-def _run(flags: Bool[np.ndarray, " bins"], start: int, gap: int = 1) -> Bool[np.ndarray, " bins"]:
+def _run(flags: Bins, start: int, gap: int = 1) -> Bins:
     """The bins from the first to the last of the set flags around `start`, across gaps of up to `gap` flags."""
     first = last = start
     while first > 0 and flags[max(first - 1 - gap, 0) : first].any():
@@ -134,11 +133,7 @@ def _run(flags: Bool[np.ndarray, " bins"], start: int, gap: int = 1) -> Bool[np.
 
 
 def _blank(
-    histogram: PostStimulusHistogram,
-    artefact: Bool[np.ndarray, " bins"],
-    spontaneous: float,
-    window_ms: Window,
-    is_elsewhere: bool,
+    histogram: PostStimulusHistogram, artefact: Bins, spontaneous: float, window_ms: Window, is_elsewhere: bool
 ) -> Iterator[Finding]:
     is_blank = (histogram.count < spontaneous / TIMES) | artefact
     zero = int(np.searchsorted(histogram.edges_ms, 0.0))
