@@ -52,17 +52,11 @@ def left_out_findings(
     """
     if not names:
         return ()
-    listed = ", ".join(_left_out(name, missing) for name in names)
+    whys = ["cannot have such values" if name in missing else did_you_mean(name, missing)[2:] for name in names]
+    listed = ", ".join(f"{name} ({why})" if why else name for name, why in zip(names, whys, strict=True))
     kind = what if any(name in missing for name in names) else f"unknown {what}"
     message = f"{kind}{f' of {file}' if file else ''} were left out: {listed}"
     return (Finding(f"{what}-left-out", "note", message, float(len(names))),)
-
-
-def _left_out(name: str, missing: Sequence[str]) -> str:
-    if name in missing:
-        return f"{name} (cannot have such values)"
-    near = did_you_mean(name, missing)
-    return f"{name} ({near[2:]})" if near else name
 
 
 def merged(findings: Iterable[Finding]) -> tuple[Finding, ...]:

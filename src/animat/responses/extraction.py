@@ -87,15 +87,15 @@ def extract_responses(
     assignment = replace(assignment, condition=np.where(shared, NO_CONDITION, assignment.condition))
     begins, setup_s = _blocks(source)
     assumed: tuple[Finding, ...] = ()
-    inside = None
+    # Whether the window after each stimulus ends within the recording, which is not known of a table.
+    inside = np.ones(len(stimuli), np.bool_)
     if isinstance(source, ResponseTable):
         window_ms, assumed = _window_of(source, by, window_ms)
     else:
         # 1e-9: the end of the recording may be the rounded time of its last stimulus or spike.
         inside = stimuli.time_s + window_ms[1] * 1e-3 <= _observed_until_s(source, begins) + 1e-9
     # Trials without a condition are read too, as the history of others.
-    is_read = stimuli.is_last_of_presentation
-    presented = np.flatnonzero(is_read if inside is None else is_read & inside)
+    presented = np.flatnonzero(stimuli.is_last_of_presentation & inside)
     rate_hz, active_ratio = _read(source, presented, window_ms)
     condition = assignment.condition[presented]
     chosen = condition != NO_CONDITION

@@ -46,11 +46,11 @@ def findings_on(
     source: Recording | ResponseTable,
     assignment: Assignment,
     bursts: BurstSeparation,
-    inside: Bool[np.ndarray, " stimuli"] | None = None,
+    inside: Bool[np.ndarray, " stimuli"],
 ) -> tuple[Finding, ...]:
     """All findings on how far responses can be trusted; those that need spike times are left out for a table.
 
-    `inside` says whether each pulse's window ends within the recording; None: all do.
+    `inside` says whether each pulse's window ends within the recording.
     """
     if isinstance(source, ResponseTable):
         message = (
@@ -86,7 +86,7 @@ def findings_on(
 
 
 def _left_out(
-    stimuli: Stimuli, assignment: Assignment, by: str, inside: Bool[np.ndarray, " stimuli"] | None
+    stimuli: Stimuli, assignment: Assignment, by: str, inside: Bool[np.ndarray, " stimuli"]
 ) -> Iterator[Finding]:
     read = stimuli.is_last_of_presentation
     n_read = int(np.count_nonzero(read))
@@ -106,7 +106,7 @@ def _left_out(
         of_these = f", {rests:,} of which deliver nothing (--conditions electrode)" if rests else ""
         message = f"left out, as they belong to no condition: {without:,} of {n_read:,} stimuli{of_these}"
         yield Finding("no-condition", "note", message, float(without))
-    if inside is not None and (late := int(np.count_nonzero(read & has_condition & ~inside))):
+    if late := int(np.count_nonzero(read & has_condition & ~inside)):
         where = "the end of the recording, or of its block"
         message = f"left out, as their window runs past {where}: {late:,} of {n_read:,} stimuli"
         yield Finding("window-past-end", "note" if late < 0.05 * n_read else "warning", message, float(late))
