@@ -20,6 +20,7 @@ from animat.recordings.recording import Recording
 from animat.recordings.time_quality import frequency_findings
 from animat.responses.extraction import extract_series
 from animat.stimulation.protocol import Order, Protocol
+from animat.stimulation.stimulus import Stimuli
 from synthetic_recordings import synthetic_recording
 from test_inspection import answering
 from test_responses import recording as of_spikes
@@ -219,3 +220,12 @@ def test_frequencies_that_contradict_the_times_cause_a_warning() -> None:
     assert not list(frequency_findings(dataclasses.replace(stimuli, frequency_hz=mixed_hz)))
     # Pauses between stimuli are none of a frequency's business.
     assert contradicted(np.full(len(true_hz), 80.0)) is None
+
+
+def test_frequencies_stated_in_only_one_of_two_simultaneous_rows_can_be_compared_with_the_times() -> None:
+    # 5 and 20 Hz are stated, but stimuli come 0.1 and 0.02 s apart.
+    time_s = np.repeat(np.cumsum(np.repeat([0.1, 0.02], 30)), 2)
+    stated_hz = np.stack([np.repeat([5.0, 20.0], 30), np.full(60, np.nan)], axis=1).ravel()
+    stimuli = Stimuli(time_s, stated_hz, np.zeros(120), np.zeros((120, 1)), np.arange(120))
+    (found,) = frequency_findings(stimuli)
+    assert "with a stated frequency of 20 Hz are 0.02 s apart (median), not 0.05 s" in found.message

@@ -127,7 +127,7 @@ def _sooner_than_stated(stimuli: Stimuli) -> Iterator[Finding]:
     sooner, regular = [], []
     for multiples_of in _multiples(stimuli):
         enough = {hz: multiples for hz, multiples in multiples_of.items() if len(multiples) >= ENOUGH_STIMULI}
-        sooner.append(min(((float(np.median(m)), hz) for hz, m in enough.items()), default=(1.0, 0.0)))
+        sooner.append(min(((float(np.median(m)), hz) for hz, m in enough.items()), default=(1.0, np.inf)))
         if _is_regular(enough):
             regular.append(sooner[-1])
     # If intervals are regular in only one of the two ways of counting, frequencies are stated in that way.
