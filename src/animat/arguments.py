@@ -63,6 +63,7 @@ _SEVERAL = {
 _NUMBERS: dict[Any, Any] = {float: Real, int: Integral}
 _UNSAID = ("ResponseTable", "str")
 """What may also come and goes without saying: a table in place of a recording, text in place of what it names."""
+_hints: Callable[..., dict[str, Any]] = functools.cache(get_type_hints)
 
 
 def checked_arguments(thing: Thing) -> Thing:
@@ -97,11 +98,6 @@ def check_argument(name: str, value: Any, hint: Any) -> None:
     """Raise InvalidArgument for a single argument that is not of a kind; for where the decorator cannot stand."""
     if strangers := _unfitting(value, hint):
         raise InvalidArgument(f"{name}: expected {_words(hint)}, got {shown(strangers[0])}")
-
-
-@functools.cache
-def _hints(function: Callable[..., Any]) -> dict[str, Any]:
-    return get_type_hints(function)
 
 
 def _unfitting(value: Any, hint: Any) -> list[Any]:

@@ -86,16 +86,14 @@ def pynwb_importable() -> Iterator[None]:
         changed = {"PYNWB_NO_CACHE_DIR": "1"}
         if not os.access(cache, os.W_OK | os.X_OK):
             changed["XDG_CACHE_HOME"] = folder
-        before = {name: os.environ.get(name) for name in changed}
+        before = {name: os.environ[name] for name in changed if name in os.environ}
         os.environ.update(changed)
         try:
             yield
         finally:
-            for name, value in before.items():
-                if value is None:
-                    del os.environ[name]
-                else:
-                    os.environ[name] = value
+            for name in changed:
+                del os.environ[name]
+            os.environ.update(before)
 
 
 def cached_njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:

@@ -42,7 +42,7 @@ class CompiledAnimats:
         InvalidArgument: as `set_up` does, for an unknown render mode, or `rgb_array` for a robot that cannot be drawn.
     """
 
-    metadata: dict[str, Any]
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 50}  # noqa: RUF012 - Gymnasium's name and form
     render_mode: str | None
 
     def __init__(self, n: int, robot: str, robot_of_id: str, render_mode: str | None, options: dict[str, Any]) -> None:
@@ -185,8 +185,6 @@ class AnimatEnv(CompiledAnimats, gymnasium.Env[Float32[np.ndarray, " observation
         options: mapping, neurons and the robot's parameters (see `animat.gym.setup.set_up`).
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 50}  # noqa: RUF012 - Gymnasium's name and form
-
     def __init__(
         self, robot: str = "", *, robot_of_id: str = "", render_mode: str | None = None, **options: Any
     ) -> None:
@@ -216,8 +214,8 @@ class AnimatEnv(CompiledAnimats, gymnasium.Env[Float32[np.ndarray, " observation
         rows = self._step(rows, np.array([action]), self.np_random)
         after, observations = self._go_on_from(rows, np.zeros(1, bool))
         # Python numbers for one readout, arrays for several.
-        info = {name: value[0] if value.ndim > 1 else value[0].item() for name, value in after.info.items()}
-        info |= {name: value[0] if value.ndim > 1 else value[0].item() for name, value in self._outcomes(after).items()}
+        known = after.info | self._outcomes(after)
+        info = {name: value[0] if value.ndim > 1 else value[0].item() for name, value in known.items()}
         terminated, truncated = (bool(each[0]) for each in after.ended)
         self._has_ended = self._has_ended or terminated or truncated
         return observations[0], float(after.reward[0]), terminated, truncated, info
@@ -241,11 +239,7 @@ class AnimatVectorEnv(CompiledAnimats, VectorEnv[Observations, Actions, Rewards]
         robot, robot_of_id, render_mode, options: as in `AnimatEnv`, the same for all.
     """
 
-    metadata = {  # noqa: RUF012 - Gymnasium's name and form
-        "render_modes": ["rgb_array"],
-        "render_fps": 50,
-        "autoreset_mode": AutoresetMode.NEXT_STEP,
-    }
+    metadata = CompiledAnimats.metadata | {"autoreset_mode": AutoresetMode.NEXT_STEP}
 
     def __init__(
         self,
