@@ -8,7 +8,7 @@ bit: float32 would round the large integers of a state, such as the data of a ra
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from typing import Any
 
 import gymnasium
@@ -157,11 +157,9 @@ def _compiled(environment: Environment[Any]) -> tuple[Any, ...]:
         state, _ = unpack(row, jax.lax.bitcast_convert_type)
         return pack(environment.advance(inputs[1:], state, inputs[0].astype(jnp.int32), simulator))
 
-    def read(rows: Rows) -> tuple[Any, Observations]:
-        return unpack(rows, np.ndarray.view)
-
     robot = environment.robot
     judge = jax.jit(jax.vmap(robot.outcome)) if isinstance(robot, RobotWithGoal) else None
+    read = partial(unpack, as_kind=np.ndarray.view)
     return jax.jit(jax.vmap(start)), jax.jit(jax.vmap(step, (0, 0, None))), read, judge
 
 

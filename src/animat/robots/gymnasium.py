@@ -102,8 +102,7 @@ class GymnasiumRobot(HostRobot):
 
         point: Any = gymnasium.spec(self.id.rpartition(":")[2]).entry_point
         # A partial function has no name.
-        place = getattr(point, "__qualname__", "")
-        entry = point if isinstance(point, str) else f"{point.__module__}:{place}"
+        entry = point if isinstance(point, str) else f"{point.__module__}:{getattr(point, '__qualname__', '')}"
         engines = {"gymnasium.envs.mujoco": "mujoco", "gymnasium.envs.box2d": "Box2D"}
         engine = next((engine for made_in, engine in engines.items() if entry.startswith(made_in)), "")
         known = importlib.metadata.packages_distributions()
@@ -168,7 +167,6 @@ class GymnasiumRobot(HostRobot):
 
 @lru_cache(maxsize=32)  # a study asks for its robots often
 def _inspected(id: str, episode_limit: int | None, settings: tuple[tuple[str, float], ...]) -> GymnasiumRobot:
-    """As `GymnasiumRobot.named`."""
     GymnasiumRobot.import_module(id)
     with time_limit(f"{FAMILY}:{id}", "being made"):
         body = _Environment(id, settings)

@@ -15,7 +15,7 @@ from animat.studies.folder import TIMELINE, policies_folder
 from animat.studies.specification import Arm, RobotSpec, Study
 from animat.studies.task import StudyTask, study_seed
 from animat.training.folder import describe, provenance_of
-from animat.training.group import Group, untrained_policies
+from animat.training.group import Group, SideBySide
 from animat.training.settings import SAC
 from animat.training.specification import Training
 
@@ -42,7 +42,7 @@ class TrainGroup(StudyTask, TrainingTask):
 
     def make(self, folder: Path, progress: Progress) -> list[Path]:
         work = self.prepare(folder)
-        return train_alone(work, progress) if self.arm.trained else work.save(untrained_policies(work.group))
+        return train_alone(work, progress) if self.arm.trained else work.save(SideBySide(work.group).policies())
 
 
 def work_on(

@@ -115,11 +115,6 @@ def _simulators_of(group: Group) -> Callable[[int], Neurons]:
     return lambda index: timeline.at(float(timeline.start_min[0]) + training.minute(index))
 
 
-def untrained_policies(group: Group) -> list[Policy]:
-    """A group's policies before their first iteration."""
-    return SideBySide(group).policies()
-
-
 def save_policies(group: Group, policies: Sequence[Policy], folder: Path) -> list[Path]:
     """Write a group's policies by their numbers in the training, with the best of each; returns the files."""
     files = [folder / f"p{member}.safetensors" for member in group.members]
@@ -219,20 +214,18 @@ class SideBySide:
 
     def policies(self) -> list[Policy]:
         """The current policies, each with its best version if they are assessed."""
-        return [self._policy(i) for i in range(len(self._places))]
-
-    def _policy(self, i: int) -> Policy:
-        done = len(self.curve)
-        curve = np.array([chunk[i] for chunk in self.curve]).reshape(-1, len(CURVE))
-        now = self._as_policy(i, self._learners.deployed, curve)
-        if self._course is None or not done or not self._groups[0].training.episodes_assessed:
-            return now
+        curves = np.array(self.curve).reshape(-1, len(self._places), len(CURVE))
+        policies = [self._policy(i, self._learners.deployed, curves[:, i]) for i in range(len(self._places))]
+        if self._course is None or not self.curve or not self._groups[0].training.episodes_assessed:
+            return policies
         state = self._course.state
-        assessments, until = state.table[:done, i].copy(), int(state.best_at[i]) + 1
-        best = replace(self._as_policy(i, state.best, curve[:until]), assessments=assessments[:until])
-        return replace(now, assessments=assessments, best=best)
+        for i, policy in enumerate(policies):
+            assessments, until = state.table[: len(self.curve), i], int(state.best_at[i]) + 1
+            best = replace(self._policy(i, state.best, curves[:until, i]), assessments=assessments[:until])
+            policies[i] = replace(policy, assessments=assessments, best=best)
+        return policies
 
-    def _as_policy(self, i: int, networks: Network, curve: np.ndarray) -> Policy:
+    def _policy(self, i: int, networks: Network, curve: np.ndarray) -> Policy:
         group, _ = self._places[i]
         training, timeline = group.training, group.timeline
         return Policy(
