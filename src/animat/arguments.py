@@ -105,9 +105,7 @@ def _unfitting(value: Any, hint: Any) -> list[Any]:
     kind, inner = get_origin(hint) or hint, get_args(hint)
     if kind in (Union, UnionType):
         return [value] if all(_unfitting(value, each) for each in inner) else []
-    if kind is Any or not isinstance(kind, type) or kind.__module__ == "jaxtyping":
-        return []
-    if issubclass(kind, np.ndarray):
+    if kind is Any or not isinstance(kind, type) or kind.__module__ == "jaxtyping" or issubclass(kind, np.ndarray):
         return []
     if issubclass(kind, tuple) and Ellipsis not in inner:
         return [] if isinstance(value, Iterable) else [value]
