@@ -94,8 +94,11 @@ def record_traces(
         at = np.rint(fired_s[fired == neuron] * rate_hz).astype(np.int64)
         at = at[at < samples]
         shape, trough = waveform(visibility.trough_to_peak_ms[neuron], visibility.recovery_ms[neuron], rate_hz)
+        sample = ((at - trough)[:, None] + np.arange(len(shape))).ravel()
+        inside = (sample >= 0) & (sample < samples)
+        sample, shapes = sample[inside], np.tile(shape, len(at))[inside]
         for column, size_uv in zip(pairs.electrode[seen].tolist(), amplitude_uv[seen].tolist(), strict=True):
-            _add(voltage_uv[:, column], at - trough, size_uv * shape)
+            np.add.at(voltage_uv[:, column], sample, (size_uv * shapes).astype(np.float32))
             spikes.append(np.column_stack(np.broadcast_arrays(at / rate_hz, column, size_uv)))
     for stimulus, at_s in zip(stimuli, stimulus_time_s.tolist(), strict=True):
         distance_um = culture.selection.array.distance_um(np.array(stimulus.electrodes), recorded)
@@ -141,9 +144,3 @@ def _band_limited_noise(
         spectrum = np.fft.rfft(rng.standard_normal(samples)) * inside
         voltage_uv[:, column] = noise_uv / np.sqrt(passed) * np.fft.irfft(spectrum, samples)
     return voltage_uv
-
-
-def _add(trace_uv: Float32[np.ndarray, " samples"], first: Int64[np.ndarray, " spikes"], shape: np.ndarray) -> None:
-    sample = (first[:, None] + np.arange(len(shape))[None, :]).ravel()
-    inside = (sample >= 0) & (sample < len(trace_uv))
-    np.add.at(trace_uv, sample[inside], np.tile(shape, len(first))[inside].astype(np.float32))
