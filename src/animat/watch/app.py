@@ -8,11 +8,11 @@ import time
 from collections import OrderedDict
 from collections.abc import Awaitable, Callable, Mapping
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from starlette.applications import Starlette
-from starlette.concurrency import run_in_threadpool
 from starlette.middleware import Middleware
 from starlette.middleware.base import BaseHTTPMiddleware, RequestResponseEndpoint
 from starlette.requests import Request
@@ -107,21 +107,15 @@ def app_for(folder: Path, token: str, port: int) -> Starlette:
     """The page of a folder as a guarded ASGI application."""
     watched = Watched(folder)
 
-    def answering(answer: Callable[[_Query], Any]) -> Callable[[Request], Any]:
-        async def endpoint(request: Request) -> Response:
-            return await run_in_threadpool(_response, answer, request.query_params)
-
-        return endpoint
-
     async def refuse(socket: WebSocket) -> None:
         await socket.send({"type": "websocket.close", "code": 1008})
 
     routes = [
-        Route("/things", answering(watched.things)),
-        Route("/about", answering(watched.about)),
-        Route("/view", answering(watched.view)),
-        Route("/robot.png", answering(watched.picture)),
-        Route("/stop", answering(watched.stop), methods=["POST"]),
+        Route("/things", partial(_response, watched.things)),
+        Route("/about", partial(_response, watched.about)),
+        Route("/view", partial(_response, watched.view)),
+        Route("/robot.png", partial(_response, watched.picture)),
+        Route("/stop", partial(_response, watched.stop), methods=["POST"]),
         WebSocketRoute("/{path:path}", refuse),
         Mount("/", StaticFiles(packages=[("animat.watch", "page")], html=True)),
     ]
@@ -129,9 +123,10 @@ def app_for(folder: Path, token: str, port: int) -> Starlette:
     return Starlette(routes=[Mount(f"/{token}", routes=routes)], middleware=[guarded])
 
 
-def _response(answer: Callable[[_Query], Any], query: _Query) -> Response:
+def _response(answer: Callable[[_Query], Any], request: Request) -> Response:
+    # Not `async`: starlette calls it in a thread, as an answer may take a while.
     try:
-        content = answer(query)
+        content = answer(request.query_params)
         return Response(content, media_type="image/png") if isinstance(content, bytes) else JSONResponse(content)
     except AnimatError as error:
         status, message = 409, str(error)

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import itertools
 import json
-from pathlib import Path
+import math
 from statistics import fmean
 from typing import Any
 
 from animat.errors import InvalidFile
-from animat.progress import Speed
 from animat.watch.discovery import state_of
 from animat.watch.files import json_of, listed, mapped, number, text, text_of
 from animat.watch.study import running_jobs, running_table
@@ -21,11 +20,8 @@ _STATES = {"complete": "complete", "stopped": "stopped early", "diverged": "dive
 
 class TuningView(View):
     kind = "tuning"
-
-    def __init__(self, folder: Path) -> None:
-        super().__init__(folder)
-        # Many trials end at the same time, followed by a long pause.
-        self._speed = Speed()
+    # Many trials end at the same time, followed by a long pause.
+    speed_over_s = math.inf
 
     def _title(self) -> str:
         robots = ", ".join(text(spec["name"]) for spec in self._manifest()["study"]["robots"])

@@ -15,7 +15,7 @@ from animat.progress import Speed, format_duration
 from animat.watch.files import json_of, number, text
 
 _MOST_SPAN_S = 60.0
-"""Longest span shown at once, and over which the speed of work is measured."""
+"""Longest span shown at once."""
 
 Width = Literal["third", "half", "two-thirds", "whole"]
 Style = Literal["line", "thin", "dashed", "dots", "steps"]
@@ -25,10 +25,12 @@ class View(abc.ABC):
     """A folder of one `kind` that is viewed repeatedly; `file` identifies it."""
 
     kind: ClassVar[Kind]
+    speed_over_s: ClassVar[float] = 60.0
+    """Longest time over which the speed of work is measured."""
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.file = folder, folder / MARKERS[self.kind][0]
-        self._speed = Speed(_MOST_SPAN_S)
+        self._speed = Speed(self.speed_over_s)
 
     def about(self) -> dict[str, Any]:
         """What does not change while work goes on; errors are those of `view`."""
