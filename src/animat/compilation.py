@@ -89,7 +89,7 @@ def pynwb_importable() -> Iterator[None]:
             yield
         finally:
             for name in changed:
-                del os.environ[name]
+                os.environ.pop(name, None)
             os.environ.update(before)
 
 

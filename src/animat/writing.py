@@ -97,10 +97,8 @@ def exclusive_lock(folder: str | os.PathLike[str]) -> Iterator[None]:
     """
     folder = Path(folder)
     with as_invalid_file(folder, "cannot be created or read", "; choose another --out"):
-        if folder.exists() and not folder.is_dir():
-            raise InvalidFile(f"{folder}: expected a folder, got a file; choose another --out")
         created = [each for each in (folder, *folder.parents) if not each.exists()]
-        if created or not any(folder.iterdir()):
+        if not folder.is_dir() or not any(folder.iterdir()):
             # Only an empty folder must be writable: one with a finished run may be read-only.
             expect_writable(folder)
         folder.mkdir(parents=True, exist_ok=True)
