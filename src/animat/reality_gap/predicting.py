@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Hashable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import replace
@@ -16,7 +16,7 @@ from jaxtyping import Float64
 from animat.environment import Environment
 from animat.errors import some_of
 from animat.evaluation.controllers import Called
-from animat.evaluation.controls import Control, Delivered
+from animat.evaluation.controls import Control
 from animat.evaluation.rollouts import Episodes, Uniform
 from animat.evaluation.statistics import Interval
 from animat.process import own_cores
@@ -76,13 +76,13 @@ def pool(predicted: Sequence[Prediction]) -> Prediction:
     return Prediction(
         np.concatenate([each.returns for each in predicted], axis=1),
         np.mean([each.bootstrap_means for each in predicted], axis=0),
-        _stacked([each.commanded for each in predicted]).summed(0),
-        _stacked([each.commanded_bootstraps for each in predicted]).summed(0),
+        _added([each.commanded for each in predicted]),
+        _added([each.commanded_bootstraps for each in predicted]),
     )
 
 
-def _stacked(commanded: Sequence[CommandSums]) -> CommandSums:
-    return CommandSums(*(np.array(sums) for sums in zip(*commanded, strict=True)))
+def _added(commanded: Sequence[CommandSums]) -> CommandSums:
+    return CommandSums(*map(np.array, zip(*commanded, strict=True))).summed(0)
 
 
 def predict(
@@ -119,10 +119,13 @@ def predict(
     # A hanging body on the host is only noticed in the main thread (`animat.robots.host.time_limit`).
     with nullcontext() if on_host else ThreadPoolExecutor(len(own_cores())) as executor:
         side_by_side = map if executor is None else executor.map
-        # First one of each kind: two of a kind that start at the same time would both be compiled.
+        # First one of each compiled program: two of a kind that start at the same time would both be compiled.
         progress.update(0, len(acting), "compiling")
-        in_jax = [number for number, control in enumerate(acting) if not isinstance(control.actor, Called)]
-        kinds = {_program_of(acting[number]): number for number in in_jax}
+        in_jax = {number: each for number, each in enumerate(acting) if not isinstance(each.actor, Called)}
+        kinds = {
+            (type(each.actor), each.delivery, each.is_drawn, each.is_turned_round, each.switch_at): number
+            for number, each in in_jax.items()
+        }
         list(side_by_side(run, kinds.values(), repeat(0)))
         for number, control in enumerate(acting):
             progress.update(number, len(acting), control.name)
@@ -135,23 +138,15 @@ def predict(
             if number:
                 rows = {control.name: [*range(control.actor.n_actors)]}
             for name, of in rows.items():
-                commanded = CommandSums(presented[:, of], total[:, of])
-                predictions[name] = _prediction(returns[:, of], commanded, rounds)
+                from_starts = returns[:, of].reshape(len(ran), -1, rounds)
+                commanded = CommandSums(presented[:, of], total[:, of]).summed(1)
+                predictions[name] = Prediction(
+                    from_starts[:ROLL_OUTS].reshape(-1, rounds).T,
+                    from_starts[ROLL_OUTS:].mean(axis=1),
+                    CommandSums(*(sums[:ROLL_OUTS] for sums in commanded)).summed(0),
+                    CommandSums(*(sums[ROLL_OUTS:] for sums in commanded)),
+                )
     return predictions
-
-
-def _prediction(
-    returns: Float64[np.ndarray, "roll_outs actors episodes"], commanded: CommandSums, rounds: int
-) -> Prediction:
-    """From roll-outs of an agent's actors, `ROLL_OUTS` on the recording's simulator, then one on each bootstrap."""
-    from_starts = returns.reshape(len(returns), -1, rounds)
-    each = commanded.summed(1)
-    return Prediction(
-        from_starts[:ROLL_OUTS].reshape(-1, rounds).T,
-        from_starts[ROLL_OUTS:].mean(axis=1),
-        CommandSums(*(sums[:ROLL_OUTS] for sums in each)).summed(0),
-        CommandSums(*(sums[ROLL_OUTS:] for sums in each)),
-    )
 
 
 def episodes_on_host(robot: Robot[Any]) -> int:
@@ -181,12 +176,6 @@ def roll_out_seed(seed: int, group: int, on: int) -> int:
 
 def _with_random_actor(control: Control) -> Control:
     """The control with a random actor where choices have no effect: without stimuli, or with shuffled delivery."""
-    if control.delivery not in ("silent", "shuffled"):
-        return control
-    delivery: Delivered = "silent" if control.delivery == "silent" else "chosen"
-    return replace(control, actor=Uniform(), delivery=delivery)
-
-
-def _program_of(control: Control) -> Hashable:
-    """What determines the compiled program of its episodes."""
-    return type(control.actor), control.delivery, control.is_drawn, control.is_turned_round, control.switch_at
+    if control.delivery == "silent":
+        return replace(control, actor=Uniform())
+    return replace(control, actor=Uniform(), delivery="chosen") if control.delivery == "shuffled" else control
