@@ -21,7 +21,7 @@ from animat.neurons.history import Ranked
 from animat.neurons.history_tracker import AdjustedRanks, HistoryState, HistoryTracker
 from animat.neurons.memory import MemorySimulator
 from animat.neurons.simulator import NeuronSimulator
-from animat.neurons.timeline import Kind, SimulatorTimeline, fit_simulator, fit_timeline, room_for
+from animat.neurons.timeline import Kind, fit_simulator, fit_timeline, room_for
 from animat.recordings.findings import Finding
 from animat.recordings.recorded_culture import RecordedCulture
 from animat.recordings.recording import Recording
@@ -136,7 +136,10 @@ class Calibration:
         timeline = fit_timeline(series, kind=kind, bins=bins, range_hz=range_hz)
         fit: dict[str, Any] = {"kind": timeline.fitted["kind"], "bins": bins, "range_hz": range_hz}
         if at_min is None:
-            at_min = _last_minute(timeline, policy)
+            first_min, last_min = timeline.start_min[[0, -1]].tolist()
+            at_min = last_min if policy is None else policy.trained_until_min(first_min)
+            # A policy that does not know its own recordings is run on the first.
+            at_min = first_min if at_min is None else at_min
         start_min = float(timeline.start_min[timeline.requested_row(at_min)])
         responses = next(each for each in series if each.start_min == start_min)
         rng = np.random.default_rng(0)
@@ -202,18 +205,6 @@ def _own_recordings(
     return own, (Finding("older-recordings", "note", what, float(older)),)
 
 
-def _last_minute(timeline: SimulatorTimeline, policy: Policy | None) -> float:
-    """The minute of the last simulator that a policy was trained on; of the last recording without a policy.
-
-    It is that of the first recording for a policy that does not know its own.
-    """
-    first_min, last_min = (float(timeline.start_min[i]) for i in (0, -1))
-    if policy is None:
-        return last_min
-    trained_until = policy.trained_until_min(first_min)
-    return first_min if trained_until is None else trained_until
-
-
 def reread(responses: Responses, adjusted: AdjustedRanks) -> Responses:
     """Replace each response by the recording's quantile of the rank that adaptive thresholds give it at its time.
 
@@ -225,11 +216,9 @@ def reread(responses: Responses, adjusted: AdjustedRanks) -> Responses:
     The recording is not in blocks, where condition and time would be confounded. Only x changes, of all channels or of
     readouts.
     """
-    first = [slice(kept) for kept in kept_counts(adjusted)]
-    first_hz, first_ranks = (
-        tuple(each[of] for each, of in zip(values, first, strict=True))
-        for values in (adjusted.responses_hz, adjusted.ranks)
-    )
+    kept = kept_counts(adjusted)
+    first_hz = tuple(each[:n] for each, n in zip(adjusted.responses_hz, kept, strict=True))
+    first_ranks = tuple(each[:n] for each, n in zip(adjusted.ranks, kept, strict=True))
     thresholds = AdaptiveThresholds(replace(adjusted, responses_hz=first_hz, ranks=first_ranks))
     read_hz, ranks = responses.read_hz, []
     histories = Ranked(responses).states(adjusted.remembering.memory)
