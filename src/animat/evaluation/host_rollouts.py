@@ -13,8 +13,7 @@ from jaxtyping import Array, Float, Key, PRNGKeyArray
 
 from animat.compilation import COMPILER_OPTIONS
 from animat.environment import Environment, Neurons, State
-from animat.errors import InvalidArgument
-from animat.evaluation.controllers import Called, CalledEpisodes
+from animat.evaluation.controllers import Called, CalledEpisodes, expect_condition
 from animat.robots.host import Bodies, HostRobot, StepResult
 from animat.robots.starts import Starts
 
@@ -112,8 +111,7 @@ def _run_wave(
     for command, delivered, stepped in _iterations(environment, simulator, actors, keys, bodies, n):
         of_bodies = stepped.reward, stepped.terminated, stepped.ended
         if (wrong := delivered[(delivered < 0) | (delivered >= n_conditions)]).size and n_conditions:
-            expected = f"the index of a condition, a whole number from 0 to {n_conditions - 1}"
-            raise InvalidArgument(f"act: expected {expected}, got {wrong[0]}")
+            expect_condition(wrong[0].item(), n_conditions)
         reward, terminated, ended = (each.reshape(len(keys), -1)[:, :n] for each in of_bodies)
         counts.returns[:] += np.where(going, reward, 0.0)
         counts.lengths[:] += going

@@ -51,42 +51,41 @@ def controls_of_own(
             raise InvalidArgument(f"agents: expected names other than {some_of(sorted(taken))}, got {name}")
         if not name.strip():
             raise InvalidArgument(f"agents: expected a name for each, got {name!r}")
-        if isinstance(agent, type):
-            raise InvalidArgument(f"agents: {name}: expected an instance, got the class {agent.__name__}: create one")
-        if not acts(agent):
-            raise InvalidArgument(f"agents: {name}: expected an Actor, or a method `act`, got {shown(agent)}")
-        has_neurons = len(environment.observation_spec) > len(environment.robot.observation_spec)
-        actor: Actor | Called
-        if isinstance(agent, Actor):
-            actor = RobotOnly(agent) if has_neurons else agent
-            _expect_actions(name, actor, environment, simulator)
-        elif sees_neurons(agent) and not has_neurons:
-            got = "one with neural_observation, which these policies do not have"
-            raise InvalidArgument(f"agents: {name}: expected one that sees the robot only, got {got}")
-        else:
-            actor = Called(agent)
-            if not isinstance(environment.robot, HostRobot):
-                _ask_once(name, actor, environment)
-        controls.append(Control(name, OWN, actor))
+        with within(f"agents: {name}"):
+            controls.append(Control(name, OWN, _actor_of(agent, environment, simulator)))
     return controls
 
 
-def _ask_once(name: str, called: Called, environment: Environment[Any]) -> None:
-    """Raise InvalidArgument for a controller that cannot act at the start of an episode, before others have theirs."""
-    seen = np.asarray(environment.observe(environment.reset(jax.random.key(0))))
-    with within(f"agents: {name}"):
+def _actor_of(agent: Actor | Controller, environment: Environment[Any], simulator: Neurons) -> Actor | Called:
+    if isinstance(agent, type):
+        raise InvalidArgument(f"expected an instance, got the class {agent.__name__}: create one")
+    if not acts(agent):
+        raise InvalidArgument(f"expected an Actor, or a method `act`, got {shown(agent)}")
+    has_neurons = len(environment.observation_spec) > len(environment.robot.observation_spec)
+    if isinstance(agent, Actor):
+        actor = RobotOnly(agent) if has_neurons else agent
+        _expect_actions(actor, environment, simulator)
+        return actor
+    if sees_neurons(agent) and not has_neurons:
+        got = "one with neural_observation, which these policies do not have"
+        raise InvalidArgument(f"expected one that sees the robot only, got {got}")
+    called = Called(agent)
+    if not isinstance(environment.robot, HostRobot):
+        # One that cannot act at the start of an episode is refused before others have theirs.
+        seen = np.asarray(environment.observe(environment.reset(jax.random.key(0))))
         CalledEpisodes(called, environment).choose(seen[None], np.zeros((1, 1), np.float32), np.ones(1, bool))
+    return called
 
 
-def _expect_actions(name: str, actor: Actor, environment: Environment[Any], simulator: Neurons) -> None:
+def _expect_actions(actor: Actor, environment: Environment[Any], simulator: Neurons) -> None:
     """Raise InvalidArgument for an actor that raises, or returns impossible actions, which JAX would not refuse."""
     parts = [np.shape(part) for part in jax.tree.leaves(actor)]
     if jax.tree.leaves(actor) == [actor]:
         expected = "expected a JAX pytree (jax.tree_util.register_static or register_dataclass)"
-        raise InvalidArgument(f"agents: {name}: {expected}, got {shown(actor)}")
+        raise InvalidArgument(f"{expected}, got {shown(actor)}")
     if any(shape[:1] != (1,) for shape in parts):
         expected = "expected one actor, each of its arrays with a first axis of length one"
-        raise InvalidArgument(f"agents: {name}: {expected}, got the shapes {', '.join(map(str, parts))}")
+        raise InvalidArgument(f"{expected}, got the shapes {', '.join(map(str, parts))}")
     try:
         if isinstance(environment.robot, HostRobot):
             # Whether an index is in range is checked later, in each step of its episodes.
@@ -94,10 +93,9 @@ def _expect_actions(name: str, actor: Actor, environment: Environment[Any], simu
             return
         found = np.unique(trace(environment, simulator, actor, episodes=8, seed=1).actions).tolist()
     except Exception as error:
-        raise InvalidArgument(f"agents: {name}: expected it to act in JAX, got {first_line(error)}") from error
+        raise InvalidArgument(f"expected it to act in JAX, got {first_line(error)}") from error
     for action in found:
-        with within(f"agents: {name}"):
-            expect_condition(action, environment.n_actions or 0)
+        expect_condition(action, environment.n_actions or 0)
 
 
 def _expect_integers(actor: Actor, environment: Environment[Any], episodes: int = 7) -> None:
