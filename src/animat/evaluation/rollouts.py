@@ -181,11 +181,9 @@ def networks_of(policies: Sequence[Policy], *, greedy: bool = False) -> Networks
         raise InvalidArgument("policies: expected at least one, got none")
     if len({tuple(w.shape for w in policy.weights) for policy in policies}) > 1:
         raise InvalidArgument("policies: expected networks of one shape, got several: evaluate them one by one")
-    layers = (
-        Layer(stacked([p.weights[i] for p in policies]), stacked([p.biases[i][None] for p in policies]))
-        for i in range(len(policies[0].weights))
-    )
-    return Networks(tuple(layers), stacked([np.asarray(p.scales, np.float32) for p in policies]), greedy)
+    layers = [[(w, b[None]) for w, b in zip(p.weights, p.biases, strict=True)] for p in policies]
+    network = tuple(Layer(*layer) for layer in jax.tree.map(stacked, *layers))
+    return Networks(network, stacked(*(np.asarray(p.scales, np.float32) for p in policies)), greedy)
 
 
 def roll_out(

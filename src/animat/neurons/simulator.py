@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple, TypeAlias, final
 
@@ -273,13 +272,9 @@ def fit_joint_histogram(
         for d, x_hz in enumerate(read_hz.T):
             order = np.lexsort((rng.random(len(x_hz)), x_hz))
             ranks[condition, order, d] = np.arange(len(x_hz))
-    return JointHistogramSimulator(
-        stacked([each.cumulative for each in alone]),
-        stacked([each.edges_hz for each in alone]),
-        to_jax(ranks),
-        to_jax(counts, np.int32),
-        stacked([each.percentiles for each in alone]),
-    )
+    together: HistogramSimulator = jax.tree.map(stacked, *alone)
+    joint = to_jax(ranks), to_jax(counts, np.int32)
+    return JointHistogramSimulator(together.cumulative, together.edges_hz, *joint, together.percentiles)
 
 
 @checked_arguments
@@ -338,7 +333,7 @@ def to_jax(values: Any, kind: type[np.generic] | None = np.float32) -> Array:
     return jnp.asarray(array, jax.dtypes.canonicalize_dtype(array.dtype))
 
 
-def stacked(leaves: Sequence[Any]) -> Array:
+def stacked(*leaves: Any) -> Array:
     """`jnp.stack` of computed arrays, but stacked on the host, so that nothing is compiled."""
     return to_jax(np.stack(leaves), None)
 

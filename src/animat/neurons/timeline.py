@@ -199,7 +199,7 @@ def fit_timeline(
         "burst_threshold": first.burst_threshold,
         "burst_thresholds": [float(responses.threshold) for responses in ordered],
     }
-    simulators = jax.tree.map(lambda *leaves: stacked(leaves), *fitted)
+    simulators = jax.tree.map(stacked, *fitted)
     same = first.conditions, first.window_ms, first.presentation
     culture = culture_of_series(responses.culture for responses in ordered)
     return SimulatorTimeline(
