@@ -131,20 +131,19 @@ def predict(simulator: NeuronSimulator | None, halves: Halves) -> Prediction:
     The condition is known and, if the simulator has a memory, everything recorded before. A histogram's draw counts as
     the largest value of the recording that is not above it, so that thresholds give the same commands.
     """
-    if simulator is None:
-        x_hz = halves.read(halves.first.read_hz)[~halves.first.is_burst].astype(np.float32)
-        share = _shares(x_hz, halves.values_hz)
-        return Prediction(halves, np.tile(share, (len(halves.rows), 1)), np.full(len(halves.rows), float(len(x_hz))))
     if isinstance(simulator, MemorySimulator):
         return _predict_with_memory(simulator, halves)
-    values_hz = halves.values_hz
-    if isinstance(simulator, EmpiricalSimulator):
+    values_hz, n_conditions = halves.values_hz, len(halves.whole.conditions)
+    if simulator is None:
+        x_hz = halves.read(halves.first.read_hz)[~halves.first.is_burst].astype(np.float32)
+        of_condition, counts = [_shares(x_hz, values_hz)] * n_conditions, np.full(n_conditions, len(x_hz))
+    elif isinstance(simulator, EmpiricalSimulator):
         counts = np.asarray(simulator.counts)
         table = halves.read(np.asarray(simulator.values_hz))
         of_condition = [_shares(x[:n], values_hz) for x, n in zip(table, counts, strict=True)]
     else:
         assert isinstance(simulator, Histograms)
-        counts = np.array([len(halves.first_of(c)) for c in range(simulator.n_conditions)])
+        counts = np.array([len(halves.first_of(c)) for c in range(n_conditions)])
         own = ... if halves.readout is None else halves.readout
         cumulatives, edges_hz = np.asarray(simulator.cumulative)[own], np.asarray(simulator.edges_hz)[own]
         of_condition = [np.diff(_p_below(each, edges_hz, values_hz[1:]), prepend=0, append=1) for each in cumulatives]
