@@ -58,13 +58,11 @@ class Commands:
         with l_k the polynomials (smooth) or hat functions (otherwise) that are 1 at node k and 0 at the others. If all
         commands are nodes, which rise, the weights are their probabilities; those of polynomials may be negative.
         """
-        if smooth:
+        if smooth or len(nodes) == 1:
             basis = np.ones((*self.levels.shape, len(nodes)))
             for k, at in enumerate(nodes):
                 for other in np.delete(nodes, k):
                     basis[..., k] *= (self.levels - other) / (at - other)
-        elif len(nodes) == 1:
-            basis = np.ones((*self.levels.shape, 1))
         else:
             left = np.clip(np.searchsorted(nodes, self.levels, side="right") - 1, 0, len(nodes) - 2)
             part = np.clip((self.levels - nodes[left]) / (nodes[left + 1] - nodes[left]), 0.0, 1.0)

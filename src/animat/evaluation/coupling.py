@@ -103,15 +103,19 @@ def best_coupling(
             progress.update(next(rounds), len(KINDS) * (RESTARTS * (1 + GENERATIONS) + 1))
         return ran.returns.mean(axis=1)  # type: ignore[no-any-return]
 
-    rounds = itertools.count(1)
+    rounds, bounds = itertools.count(1), (-LARGEST_WEIGHT, LARGEST_WEIGHT)
     size = n_commands * (len(seen) + 1)
     per_weight = max(8, -(-40 // size))
     near_heuristic = _near_heuristic(environment, simulator, seen, seed)
 
-    def last_generation(kind: Kind, draws: int, episodes: int, first: Any) -> Float64[np.ndarray, "actors weights"]:
+    def last_generation(kind: Kind, restart: int, draws: int, episodes: int) -> Float64[np.ndarray, "actors weights"]:
+        first: Any = "latinhypercube"
+        if restart and len(near_heuristic):
+            others = np.random.default_rng([draws, 1]).uniform(*bounds, (per_weight * size - len(near_heuristic), size))
+            first = np.concatenate([near_heuristic, others])
         search = differential_evolution(
             lambda w: -mean_returns(actor(kind, w.T), EPISODES, episodes),
-            [(-LARGEST_WEIGHT, LARGEST_WEIGHT)] * size,
+            [bounds] * size,
             maxiter=GENERATIONS,
             popsize=per_weight,
             init=first,
@@ -127,14 +131,7 @@ def best_coupling(
     fresh = seeds[0][0][0] + 1
     best = []
     for kind, of_kind in zip(KINDS, seeds, strict=True):
-        last = []
-        for restart, (draws, episodes) in enumerate(of_kind):
-            first: Any = "latinhypercube"
-            if restart and len(near_heuristic):
-                bounds, others = (-LARGEST_WEIGHT, LARGEST_WEIGHT), (per_weight * size - len(near_heuristic), size)
-                first = np.concatenate([near_heuristic, np.random.default_rng([draws, 1]).uniform(*bounds, others)])
-            last.append(last_generation(kind, draws, episodes, first))
-        candidates = np.concatenate(last)
+        candidates = np.concatenate([last_generation(kind, i, *of_search) for i, of_search in enumerate(of_kind)])
         returns = mean_returns(actor(kind, candidates), FRESH_EPISODES, fresh)
         best.append((float(returns.max()), actor(kind, candidates[[returns.argmax()]])))
     return max(best, key=lambda each: each[0])[1]
