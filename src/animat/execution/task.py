@@ -79,10 +79,16 @@ def _holding(lock: IO[str]) -> Iterator[None]:
     then written atomically, with the same bytes.
     """
     last_mtime, since_s = 0.0, time.monotonic()
-    while not _has_locked(lock):
-        if (mtime := os.fstat(lock.fileno()).st_mtime) != last_mtime:
-            last_mtime, since_s = mtime, time.monotonic()
-        elif time.monotonic() - since_s > SILENT_S:
+    while True:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            break
+        except BlockingIOError:
+            if (mtime := os.fstat(lock.fileno()).st_mtime) != last_mtime:
+                last_mtime, since_s = mtime, time.monotonic()
+            elif time.monotonic() - since_s > SILENT_S:
+                break
+        except OSError:
             break
         time.sleep(0.2)
     ended = threading.Event()
@@ -98,16 +104,6 @@ def _holding(lock: IO[str]) -> Iterator[None]:
     finally:
         ended.set()
         thread.join()
-
-
-def _has_locked(lock: IO[str]) -> bool:
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    except OSError:
-        pass
-    return True
 
 
 def carry_out(task: Task, folder: Path, notice: Path) -> TaskResult:
@@ -127,12 +123,11 @@ def carry_out_together(
     except AnimatError:
         raise
     except Exception as error:
-        place, memory = traceback.extract_tb(error.__traceback__)[-1], out_of_memory(error)
+        if (memory := out_of_memory(error)) is not None:
+            raise AnimatError(f"{memory}: {memory_of(tasks[0])}") from error
+        place = traceback.extract_tb(error.__traceback__)[-1]
         where = f"(in {place.name}, {Path(place.filename).name}, line {place.lineno})"
-        reason = (
-            f"{first_line(error, with_place=False)} {where}" if memory is None else f"{memory}: {memory_of(tasks[0])}"
-        )
-        raise AnimatError(reason) from error
+        raise AnimatError(f"{first_line(error, with_place=False)} {where}") from error
     digests = [{file.relative_to(folder).as_posix(): digest_of(file) for file in sorted(files)} for files in written]
     cpu_s = (time.process_time() - began_s) / len(tasks)
     return [TaskResult(files, cpu_s) for files in digests]
