@@ -66,10 +66,10 @@ def submit_with_gpu(
         at_once = [task for number in numbers if isinstance(task := tasks[number], TrainingTask)]
         together = gpu.submit(train_together, at_once, folder, [notices[number] for number in numbers])
         futures |= dict(zip(numbers, _split(together, len(numbers)), strict=True))
-    for number, task in enumerate(tasks):
-        if number not in futures:
-            futures[number] = cores.submit(carry_out_alone, task, folder, notices[number])
-    return [futures[number] for number in range(len(tasks))]
+    return [
+        futures.get(number) or cores.submit(carry_out_alone, task, folder, notices[number])
+        for number, task in enumerate(tasks)
+    ]
 
 
 def _split(together: Future[list[TaskResult]], n: int) -> list[Future[TaskResult]]:

@@ -9,7 +9,7 @@ from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, final
+from typing import final
 
 from animat.arguments import checked_arguments
 from animat.coding.decoder import expect_fit
@@ -100,30 +100,21 @@ def train(
         missing = [group for group in groups if not _is_trained(group, folder)]
         curves = Curves(folder, groups, callbacks, _phase_of(missing, progress))
         if missing:
-            tasks = [TrainGroup(group, checkpoint_s, writes_rows=bool(callbacks)) for group in missing]
-            how: dict[str, Any] = {"workers": workers, "executor": executor, "has_gpu": gpu is not None}
-            _run(tasks, folder, manifest["fingerprint"], curves, **how)
+            tasks = {as_range(group.members): TrainGroup(group, checkpoint_s, bool(callbacks)) for group in missing}
+            left = [Job(name, task, cost_s=CHUNKS * len(task.group.members)) for name, task in tasks.items()]
+            jobs = Jobs(left, folder, folder / UNFINISHED / "jobs", manifest["fingerprint"])
+            try:
+                jobs.run(workers=workers, executor=executor, progress=curves, has_gpu=gpu is not None)
+            except UnusableData:
+                # Numbers of the robot were not finite: after its correction, unfinished policies must start again.
+                shutil.rmtree(folder / UNFINISHED, ignore_errors=True)
+                if not any(folder.glob("p*.safetensors")):
+                    (folder / MANIFEST).unlink()
+                raise
         shutil.rmtree(folder / UNFINISHED, ignore_errors=True)
         policies = finish(training, folder)
         curves.finish(policies)
     return policies
-
-
-def _run(tasks: Sequence[TrainGroup], folder: Path, fingerprint: str, progress: Progress, **how: Any) -> None:
-    """Run the tasks as jobs, with options of `Jobs.run`.
-
-    If the robot returned numbers that are not finite, unfinished policies are removed: after its correction, they must
-    start again.
-    """
-    left = [Job(as_range(task.group.members), task, cost_s=CHUNKS * len(task.group.members)) for task in tasks]
-    jobs = Jobs(left, folder, folder / UNFINISHED / "jobs", fingerprint)
-    try:
-        jobs.run(progress=progress, **how)
-    except UnusableData:
-        shutil.rmtree(folder / UNFINISHED, ignore_errors=True)
-        if not any(folder.glob("p*.safetensors")):
-            (folder / MANIFEST).unlink()
-        raise
 
 
 @final
