@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import logging
 import os
@@ -157,17 +158,16 @@ def _expect_listener(address: str) -> None:
     host, _, port = place.rpartition(":")
     if has_kind and kind != "tcp":
         return
-    until_s, is_said = time.monotonic() + _CONNECT_S, False
-    while True:
+    until_s = time.monotonic() + _CONNECT_S
+    for attempt in itertools.count():
         try:
             socket.create_connection((host.strip("[]"), int(port)), timeout=_CONNECT_S).close()
             return
         except OSError:
             if time.monotonic() > until_s:
                 raise
-        if not is_said:
+        if attempt == 0:
             print(f"cluster: waiting up to {_CONNECT_S} s for the scheduler at {address}", file=sys.stderr)
-            is_said = True
         time.sleep(0.2)
 
 
@@ -228,12 +228,12 @@ def _stop(process: subprocess.Popen[bytes]) -> None:
 
 
 def _start(part: str, file: Path, *options: str) -> subprocess.Popen[bytes]:
-    quiet = {"DASK_LOGGING__DISTRIBUTED": "critical"}
     module = f"distributed.cli.dask_{part}"
+    # The path as for pinned processes: robots may be defined next to a script.
+    own = {"DASK_LOGGING__DISTRIBUTED": "critical", "PYTHONPATH": os.pathsep.join(sys.path)}
     return subprocess.Popen(
         [sys.executable, "-c", _RUN, module, "--no-dashboard", "--scheduler-file", file, *options],
-        # As for pinned processes: robots may be defined next to a script.
-        env={**os.environ, **quiet, "PYTHONPATH": os.pathsep.join(sys.path)},
+        env={**os.environ, **own},
         # Ctrl-C reaches only this process, which then ends the others.
         process_group=0,
     )

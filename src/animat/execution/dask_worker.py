@@ -54,7 +54,9 @@ class _Core:
         began_s = time.monotonic()
         future = self._processes.submit(_answer, call)
         while not wait([future], _LOOK_EVERY_S).done:
-            if not _is_wanted(worker, key):
+            task = worker.state.tasks.get(key)
+            is_wanted = task is not None and task.state == "executing"
+            if not is_wanted or worker.status.name not in ("running", "paused"):
                 self._renew()
                 raise AnimatError("nobody is waiting for it any more")
         took_s = time.monotonic() - began_s
@@ -127,11 +129,6 @@ def versions_tag() -> str:
 def _answer(call: bytes) -> Any:
     function, args, kwargs = pickle.loads(call)
     return function(*args, **kwargs)
-
-
-def _is_wanted(worker: Any, key: object) -> bool:
-    task = worker.state.tasks.get(key)
-    return task is not None and task.state == "executing" and worker.status.name in ("running", "paused")
 
 
 def _own_cores(threads: int) -> list[int]:

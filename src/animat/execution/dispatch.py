@@ -123,7 +123,7 @@ class Dispatch:
 
     def _enqueue(self, call: Call) -> None:
         if self._has_ended:
-            _cancel(call)
+            _give_up([call])
         else:
             self._waiting.append(call)
             self._assign()
@@ -223,8 +223,7 @@ class Dispatch:
             await self._send(batch)
         except Exception as error:
             # Any error is passed on, as somebody is waiting.
-            for call in batch.calls:
-                _settle(call, error=error)
+            _give_up(batch.calls, error)
         batch.place.batches.remove(batch)
         self._assign()
 
@@ -275,13 +274,11 @@ class Dispatch:
         if type(error).__name__ == "KilledWorker":
             _count_death(left[0], "its worker ended")
         elif error is not None and "Cancelled" not in type(error).__name__:
-            for call in left:
-                _settle(call, error=error)
+            _give_up(left, error)
         elif self._client.status != "running":
             self._end()
         if self._has_ended:
-            for call in left:
-                _cancel(call)
+            _give_up(left)
 
     async def _on_call_done(self, event: tuple[float, dict[str, Any]]) -> None:
         _, message = event
@@ -319,18 +316,18 @@ class Dispatch:
     def _end(self, error: Exception | None = None) -> None:
         """Give up all calls, as the scheduler has ended, or with an unexpected error."""
         self._has_ended = True
-        for call in (*self._waiting, *(call for batch in self._batches.values() for call in batch.calls)):
-            if error is None:
-                _cancel(call)
-            else:
-                _settle(call, error=error)
+        _give_up([*self._waiting, *(call for batch in self._batches.values() for call in batch.calls)], error)
         self._waiting.clear()
 
 
-def _cancel(call: Call) -> None:
-    if not call.future.done() and call.future.cancel():
-        # Needed to wake those who wait for the future.
-        call.future.set_running_or_notify_cancel()
+def _give_up(calls: Sequence[Call], error: BaseException | None = None) -> None:
+    """End calls that are not done with an error, or cancel them."""
+    for call in calls:
+        if error is not None:
+            _settle(call, error=error)
+        elif not call.future.done() and call.future.cancel():
+            # Needed to wake those who wait for the future.
+            call.future.set_running_or_notify_cancel()
 
 
 def _count_death(call: Call, reason: str) -> None:
