@@ -59,6 +59,11 @@ def describe_study(study: Study, sources: dict[str, str], device: str | None = N
     return with_fingerprint({"study": asdict(study), "sources": sources, "versions": versions, "seeds": seeds})
 
 
+def hash_sources(study: Study, base: Path) -> dict[str, str]:
+    """`hash_files` of a study's recordings."""
+    return hash_files(source_files(study, base), base)
+
+
 def source_files(study: Study, base: Path) -> list[Path]:
     """The files of a study's recordings; their names are relative to `base`."""
     if study.culture.seeds or study.culture.folders:

@@ -19,16 +19,7 @@ from animat.execution.jobs import Job, Jobs, expect_workers
 from animat.execution.task import UNFINISHED
 from animat.progress import Progress, Silent
 from animat.robots.checking import check_robot
-from animat.studies.folder import (
-    MANIFEST,
-    RECEIPTS,
-    REPORT,
-    SPECIFICATION,
-    claim_folder,
-    describe_study,
-    hash_files,
-    source_files,
-)
+from animat.studies.folder import MANIFEST, RECEIPTS, REPORT, SPECIFICATION, claim_folder, describe_study, hash_sources
 from animat.studies.specification import Arm, RobotSpec, Study
 from animat.studies.toml import study_to_toml
 
@@ -83,7 +74,7 @@ def run_study(
     folder, base = Path(folder).absolute(), Path(base).absolute()
     gpu = find_gpu() if executor is None else None
     check_custom(study.robots, [arm.mapping for arm in study.arms])
-    manifest = describe_study(study, hash_files(source_files(study, base), base), gpu)
+    manifest = describe_study(study, hash_sources(study, base), gpu)
     specification = _ABOUT_FILES * (study.culture.kind == "files") + study_to_toml(study)
     with claim_folder(folder, "study", manifest, MANIFEST, {SPECIFICATION: specification}):
         jobs = plan_study(study, base)

@@ -20,7 +20,7 @@ from animat.execution.task import UNFINISHED
 from animat.folders import with_fingerprint
 from animat.process import own_cores
 from animat.progress import Part, Progress, Silent
-from animat.studies.folder import OWN_FOLDERS, RECEIPTS, claim_folder, describe_study, hash_files, source_files
+from animat.studies.folder import OWN_FOLDERS, RECEIPTS, claim_folder, describe_study, hash_sources
 from animat.studies.recording import JOB, Record
 from animat.studies.run import ITERATIONS_PER_S, check_custom
 from animat.studies.task import draw_seed
@@ -59,9 +59,9 @@ def tune(
     study = tuning.study
     # Checked before the folder is created.
     check_custom(study.robots, choices_of("mapping", tuning.space, study))
-    sources = hash_files(source_files(study, base), base)
-    versions = {**describe_study(study, sources)["versions"], "optuna": importlib.metadata.version("optuna")}
-    manifest = with_fingerprint({**tuning.to_dict(), "sources": sources, "versions": versions})
+    described = describe_study(study, hash_sources(study, base))
+    versions = {**described["versions"], "optuna": importlib.metadata.version("optuna")}
+    manifest = with_fingerprint({**tuning.to_dict(), "sources": described["sources"], "versions": versions})
     # Our own processes are reused from one part of the work to the next.
     context: AbstractContextManager[Executor] = (
         PinnedProcesses(own_cores(workers)) if executor is None else nullcontext(executor)
