@@ -97,11 +97,9 @@ class Search:
         """Propose the settings of the next `n` trials, before the result of any of them is known."""
         self._running = [self._study.ask(self._distributions) for _ in range(n)]
         proposed = [_mirrored(self._space, trial.params) for trial in self._running]
-        # The study's own settings as they were written: converted there and back, 0.1 would be 0.09999999999999998.
-        for trial, settings in zip(self._running, proposed, strict=True):
-            if trial.number < len(self._first):
-                settings.update(self._first[trial.number])
-        return proposed
+        # The first as they were written: converted there and back, 0.1 would be 0.09999999999999998.
+        first = self._first[self._running[0].number :][:n]
+        return first + proposed[len(first) :]
 
     def report(self, results: Sequence[Trial]) -> None:
         """Report the results of the trials proposed last, in the same order."""
