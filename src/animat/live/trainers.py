@@ -80,15 +80,13 @@ class TrainAlongside(Task):
         # The policies' provenance lists their swaps, which are added below.
         group = replace(self.group, provenance={**self.group.provenance, "swaps": swaps})
         together = SideBySide(group)
-        number, simulator, index, saved_s = -1, None, 0, time.monotonic()
-        state: dict[str, Any] = {"using": number, "iterations": 0, "mean_return": float("nan"), "swaps": []}
+        simulator, index, saved_s = None, 0, time.monotonic()
+        state: dict[str, Any] = {"using": -1, "iterations": 0, "mean_return": float("nan"), "swaps": []}
         while not (self.exchange.is_finished and index):
-            newer = self.exchange.newest(number)
-            if newer is not None:
-                number, start_min, simulator = newer
+            if (newer := self.exchange.newest(state["using"])) is not None:
+                state["using"], start_min, simulator = newer
                 swaps.append({"chunk": index, "iterations": state["iterations"], "recorded_at_min": start_min})
-                state["using"] = number
-                state["swaps"].append({"swap": number, **swaps[-1]})
+                state["swaps"].append({"swap": state["using"], **swaps[-1]})
                 report(reports, state)
             if simulator is None:
                 raise AnimatError("live: expected a simulator in the exchange before training began, got none")
@@ -134,8 +132,7 @@ class Trainers:
 
     @property
     def iterations(self) -> int:
-        fewest: int = min(report["iterations"] for report in self._reports.values())
-        return fewest
+        return int(min(report["iterations"] for report in self._reports.values()))
 
     @property
     def mean_return(self) -> float:
@@ -158,8 +155,7 @@ class Trainers:
                 raise AnimatError(f"training {names}: {error} meanwhile; the recordings are kept") from error
         swaps: list[dict[str, Any]] = []
         for group in self._groups:
-            latest = reported(self._exchange.report_of(group))
-            if latest is not None:
+            if (latest := reported(self._exchange.report_of(group))) is not None:
                 known = len(self._reports[group]["swaps"]) if group in self._reports else 0
                 swaps += [{"members": list(group.members), **swap} for swap in latest["swaps"][known:]]
                 self._reports[group] = latest
