@@ -6,7 +6,7 @@ import importlib.metadata
 import json
 import os
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
@@ -126,21 +126,18 @@ class _Run:
 
     def _run_batch(self, trials: Sequence[Trial], place: str) -> list[Trial]:
         """Successive halving: all trials up to the first rung, the best of them up to the next, and so on."""
-        tune = self._tuning.tune
+        tune, study = self._tuning.tune, self._tuning.study
         seeds = draw_seed("tuning", tune.seed, "training"), draw_seed("tuning", tune.seed, "episodes")
         members, rungs = tuple(range(tune.policies)), tune.chunks
         results = {trial.trial: trial for trial in trials}
         for rung, (first, last) in enumerate(zip([0, *rungs], rungs, strict=False)):
             racing = [trial for trial in results.values() if trial.state == "complete"]
-            jobs = [
-                self._job(
-                    f"rung-{rung + 1}/trials-{','.join(str(trial.trial) for trial in group)}",
-                    TrainTrials(self._tuning.study, group, members, seeds, tune.episodes, (first, last), place),
-                )
-                for group in group_by_shape(racing, tune.policies)
-            ]
+            tasks = {}
+            for group in group_by_shape(racing, tune.policies):
+                name = f"rung-{rung + 1}/trials-{','.join(str(trial.trial) for trial in group)}"
+                tasks[name] = TrainTrials(study, group, members, seeds, tune.episodes, (first, last), place)
             note = f"trials {trials[0].trial} to {trials[-1].trial} of {tune.trials}, rung {rung + 1} of {len(rungs)}"
-            self._run_jobs(jobs, f"{place}/jobs", sum(job.cost_s for job in jobs), note)
+            self._train(tasks, f"{place}/jobs", note)
             for trial in racing:
                 returns = json.loads(returns_file(self._folder / place, trial, last, 0).read_text())
                 if returns is None:
@@ -171,15 +168,11 @@ class _Run:
         finalists = [*results[: self._first], *others]
         seeds = draw_seed("tuning", tune.seed, "final training"), draw_seed("tuning", tune.seed, "final episodes")
         split = split_groups(study.policies)
-        jobs = [
-            self._job(
-                f"final/trial-{trial.trial}/p{members[0]}",
-                TrainTrials(study, (trial,), members, seeds, study.episodes, (0, CHUNKS), FINALS),
-            )
-            for trial in finalists
-            for members in split
-        ]
-        self._run_jobs(jobs, RECEIPTS, sum(job.cost_s for job in jobs), "retraining the first and the best settings")
+        tasks = {}
+        for trial, members in product(finalists, split):
+            task = TrainTrials(study, (trial,), members, seeds, study.episodes, (0, CHUNKS), FINALS)
+            tasks[f"final/trial-{trial.trial}/p{members[0]}"] = task
+        self._train(tasks, RECEIPTS, "retraining the first and the best settings")
         finals = []
         for trial in finalists:
             files = (returns_file(self._folder / FINALS, trial, CHUNKS, members[0]) for members in split)
@@ -190,10 +183,13 @@ class _Run:
             raise UnusableData(f"{self._folder}: expected finite returns of the best trials, got none")
         return finals
 
-    def _job(self, name: str, task: TrainTrials) -> Job:
-        first, last = task.chunks
-        cost_s = _COMPILING_S + self._cost_s(len(task.trials) * len(task.members), last - first)
-        return Job(name, task, (), cost_s, task.reads)
+    def _train(self, tasks: Mapping[str, TrainTrials], receipts: str, note: str) -> None:
+        jobs = []
+        for name, task in tasks.items():
+            first, last = task.chunks
+            cost_s = _COMPILING_S + self._cost_s(len(task.trials) * len(task.members), last - first)
+            jobs.append(Job(name, task, (), cost_s, task.reads))
+        self._run_jobs(jobs, receipts, sum(job.cost_s for job in jobs), note)
 
     def _run_jobs(self, jobs: list[Job], receipts: str, cost_s: float, note: str) -> None:
         left = Jobs(jobs, self._folder, self._folder / receipts, self._fingerprint)
