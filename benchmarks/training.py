@@ -216,22 +216,10 @@ def rate(policies: int, repeats: int) -> dict[str, Any]:
 
 def timeline() -> Any:
     """The synthetic culture as a timeline of one recording."""
-    import jax
-    import numpy as np
+    import synthetic
+    from animat.neurons.synthetic import synthetic_simulator
 
-    from animat.neurons.synthetic import LABELS, synthetic_simulator
-    from animat.neurons.timeline import SimulatorTimeline
-    from animat.responses.condition import Condition
-
-    return SimulatorTimeline(
-        simulators=jax.tree.map(lambda leaf: leaf[None], synthetic_simulator()),
-        start_min=np.zeros(1),
-        conditions=tuple(Condition(label, float(label.split()[0]), "Hz") for label in LABELS),
-        window_ms=(2.0, 10.0),
-        presentation=None,
-        fidelities=(),
-        findings=(),
-    )
+    return synthetic.timeline(synthetic_simulator())
 
 
 def training(policies: int, iterations: int, seed: int = 1) -> Any:
