@@ -1,9 +1,11 @@
 """The optimal return on synthetic responses, on finer and coarser grids, and how often its interval contains it.
 
     python benchmarks/optimal_return.py mappings grids
+    python benchmarks/optimal_return.py memory [--recordings recordings/]
     python benchmarks/optimal_return.py coverage [--series 60]
 
-*mappings* and *grids* take a few minutes. *coverage* takes seconds for each series of responses, so hours in all.
+*mappings*, *grids* and *memory* (of the last of some recordings) take a few minutes. *coverage* takes seconds for each
+series of responses, so hours in all.
 """
 
 from __future__ import annotations
@@ -13,7 +15,9 @@ import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from unittest import mock
 
+import animat
 from animat import Animat, Cartpole, Linear, Navigation, Thresholds, WithoutNeurons, best_returns
 from animat.environment import Environment
 from animat.evaluation.optimal_returns import WellSampled
@@ -60,6 +64,22 @@ def grids() -> None:
         print(f"| {resolution} | " + " | ".join(f"{each.value:.2f}" for each in found) + " |", flush=True)
 
 
+def memory(recordings: str) -> None:
+    """The cartpole's optimum on the simulator with memory of the last recording, with several numbers of classes."""
+    print("| thresholds | classes | optimal return | run with the clock | without the clock |\n|---|---|---|---|---|")
+    responses = animat.extract_series(animat.read_recordings(recordings))[-1]
+    simulator = animat.fit_memory(responses)
+    for n in (1, 9):
+        environment = Animat(Cartpole(), Thresholds(n), len(responses.conditions))
+        for classes in (4, 6, 10):
+            modules = (mock.patch(f"animat.evaluation.{name}.CLASSES", classes) for name in ("commands", "optimum"))
+            with next(modules), next(modules):
+                (best,) = best_returns([(environment, simulator)], resolution=0.6, episodes=1000)
+            with_clock = f"{best.monte_carlo:.1f} ± {best.standard_error:.1f}"
+            without = f"{best.without_clock:.1f} ± {best.without_clock_standard_error:.1f}"
+            print(f"| {n} | {classes} | {best.value:.1f} | {with_clock} | {without} |", flush=True)
+
+
 def coverage(series: int) -> None:
     """How often the 95 % interval, without the grid's error, contains the optimum of the true distributions."""
     print("| responses per condition | " + " | ".join(SPREADS) + " |\n|---" + "|---" * len(SPREADS) + "|")
@@ -98,13 +118,16 @@ def _best(environment: Environment, simulator: NeuronSimulator) -> Optimum:
 def main() -> None:
     """Print the tables that were asked for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("tables", nargs="+", choices=("mappings", "grids", "coverage"))
+    parser.add_argument("tables", nargs="+", choices=("mappings", "grids", "memory", "coverage"))
+    parser.add_argument("--recordings", default="recordings", help="for memory")
     parser.add_argument("--series", type=int, default=60, help="of responses, for each number of them")
     given = parser.parse_args()
     if "mappings" in given.tables:
         mappings()
     if "grids" in given.tables:
         grids()
+    if "memory" in given.tables:
+        memory(given.recordings)
     if "coverage" in given.tables:
         coverage(given.series)
 

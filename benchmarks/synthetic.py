@@ -86,9 +86,9 @@ def trained(robot: str, n: int, iterations: int, policies: int, simulator: Any, 
 
 
 def averaging() -> None:
-    """Ten policies with the actor averaged over about the last quarter of training, and over the last ninth."""
+    """Five policies with the actor averaged over about the last quarter of training, and over the last ninth."""
     for exponent in (3, 8):
-        returns = trained("cartpole", 1, 400_000, 10, synthetic_simulator(), averaging_exponent=exponent)
+        returns = trained("cartpole", 1, 400_000, 5, synthetic_simulator(), averaging_exponent=exponent)
         print(f"averaging_exponent {exponent}: {shown(returns)}", flush=True)
 
 
