@@ -74,7 +74,7 @@ def memory(recordings: str) -> None:
         for classes in (4, 6, 10):
             modules = (mock.patch(f"animat.evaluation.{name}.CLASSES", classes) for name in ("commands", "optimum"))
             with next(modules), next(modules):
-                (best,) = best_returns([(environment, simulator)], resolution=0.6, episodes=1000)
+                (best,) = best_returns([(environment, simulator)], resolution=0.6, episodes=EPISODES)
             with_clock = f"{best.monte_carlo:.1f} ± {best.standard_error:.1f}"
             without = f"{best.without_clock:.1f} ± {best.without_clock_standard_error:.1f}"
             print(f"| {n} | {classes} | {best.value:.1f} | {with_clock} | {without} |", flush=True)
