@@ -16,6 +16,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from urllib.error import HTTPError
 
 import pytest
 
@@ -78,8 +79,9 @@ def test_a_command_that_is_watched_serves_its_folder(tmp_path: Path, capsys: pyt
         assert address is not None
         with http(address[0] + "things") as answer:
             assert b'"session"' in answer.read()
-        with pytest.raises(OSError, match="403"):
+        with pytest.raises(HTTPError, match="403") as refused:
             http(re.sub(r"/[\w-]+/$", "/wrong/", address[0]))
+        refused.value.close()
     end_servers()
 
 

@@ -47,11 +47,13 @@ def is_folder(path: Path) -> bool:
 
 
 def is_absent(path: Path) -> bool:
-    """Whether no file or folder has this name; False, without an error, for an impossible name."""
+    """Whether no file or folder has this name; False, without an error, for a name that the system refuses."""
+    # `Path.exists` would also be False for such a name since Python 3.14.
     try:
-        return not path.exists()
-    except (OSError, ValueError):
-        return False
+        path.stat()
+    except (OSError, ValueError) as error:
+        return getattr(error, "errno", None) in (errno.ENOENT, errno.ENOTDIR, errno.ELOOP)
+    return False
 
 
 def read_plain_text(path: str | os.PathLike[str], most_bytes: int) -> str:

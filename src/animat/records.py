@@ -108,6 +108,9 @@ def json_data(text: str, what: str, like: str = "JSON") -> Any:
     except (ValueError, RecursionError) as error:
         # Also for a number with more digits than Python reads; its advice on that is cut off.
         reason = str(error).partition("; use sys.")[0]
+        if isinstance(error, RecursionError):
+            # In the same words by all versions of Python.
+            reason = "maximum recursion depth exceeded"
         raise InvalidArgument(f"{what}: expected {like}, got malformed text: {reason}") from error
 
 

@@ -34,7 +34,7 @@ from animat.neurons.simulator import (
 )
 from animat.recordings.findings import Finding
 from animat.recordings.recorded_culture import RecordedCulture, culture_of_series
-from animat.records import read_record
+from animat.records import json_data, read_record
 from animat.responses.condition import Condition
 from animat.responses.quality.one_culture import series_findings, series_mismatch
 from animat.responses.readouts import ALL, Readouts
@@ -233,7 +233,7 @@ def load_timeline(path: Path) -> SimulatorTimeline:
     """Read what `save_timeline` wrote; raises InvalidFile if it cannot be read."""
     try:
         with safe_open(path, framework="numpy") as file:
-            metadata: dict[str, Any] = json.loads((file.metadata() or {})["animat"])
+            metadata: dict[str, Any] = json_data((file.metadata() or {})["animat"], "metadata")
             arrays = {name: to_jax(file.get_tensor(name), None) for name in file.keys()}  # noqa: SIM118 - no dictionary
         conditions = tuple(Condition(**each) for each in metadata["conditions"])
         labels = tuple(condition.label for condition in conditions)
