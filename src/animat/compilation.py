@@ -60,13 +60,16 @@ def keep_compilations() -> None:
     jax.config.update("jax_numpy_rank_promotion", "allow")
     gc.freeze()
     folder = cache_folder()
-    with suppress(OSError):
+    try:
         folder.mkdir(parents=True, exist_ok=True)
-    # Elsewhere JAX would warn about every program that it cannot keep.
-    if folder.is_dir() and os.access(folder, os.W_OK | os.X_OK):
-        jax.config.update("jax_compilation_cache_dir", str(folder))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-        jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+    except OSError:
+        return
+    if not os.access(folder, os.W_OK | os.X_OK):
+        # JAX would warn about every program that it cannot keep.
+        return
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 
 
 @contextmanager
