@@ -878,6 +878,7 @@ def test_an_error_of_an_argument_begins_with_its_option(
             [
                 "robot: expected one of arm, cartpole, detour, navigation, shuttle, swing-up, wheels, got 'unicycle'",
                 "module:Class",
+                "and those of Gymnasium by gymnasium:ID",
             ],
         ),
         (["train", "cartpole", "--polices", "3"], 2, ["animat: unknown option --polices; did you mean --policies?"]),

@@ -140,9 +140,10 @@ class Registry(Generic[Thing]):
         """The class of this name; arguments and errors as in `named`."""
         kind = self._family_of(name) or self._kind(name)
         if kind is None:
+            others = "".join(f", and those of {family.capitalize()} by {family}:ID" for family in self._families)
             raise InvalidArgument(
                 f"{self.noun}: expected one of {', '.join(self.names())}, got {shown(name)}"
-                + (did_you_mean(str(name), self.names()) or "; name your own by its module:Class")
+                + (did_you_mean(str(name), self.names()) or f"; name your own by its module:Class{others}")
             )
         return kind
 
