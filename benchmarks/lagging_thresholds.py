@@ -19,8 +19,9 @@ from animat import Animat, extract_series, fit_timeline, load_policies, read_rec
 from animat.evaluation.rollouts import networks_of, roll_out
 
 DEVIATIONS = (0.0, 0.02, 0.03, 0.04, 0.05)
-ERRORS = ndtri((np.arange(11) + 0.5) / 11)
-"""Equally likely values of a standard normal error."""
+_QUANTILES = ndtri((np.arange(11) + 0.5) / 11)
+ERRORS = _QUANTILES / _QUANTILES.std()
+"""Equally likely values of a normal error with a standard deviation of 1."""
 
 
 def returns_of(culture: Path) -> list[float]:
