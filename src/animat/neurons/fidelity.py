@@ -49,12 +49,13 @@ class Fidelity:
         if (value := float(loss[worst])) > LARGEST_LOSS:
             of = self.labels[worst[0]] + (f" on {self.readouts[worst[1]]}" if loss.ndim == 2 else "")
             changed = f"changes P(x >= P50) of {of} from {self.in_data[worst]:.2f} to {self.in_simulator[worst]:.2f}"
-            name, what = "binning", "the histogram"
-            remedy = "use more bins, no range (edges are then percentiles) or the empirical simulator"
             if of_memory:
-                name, what = "few-neighbours", "drawing from similar histories"
                 remedy = "with so few responses some are drawn too often; record more"
-            found.append(Finding(name, "warning", f"{what} {changed}: {remedy}", value))
+                message = f"drawing from similar histories {changed}: {remedy}"
+                found.append(Finding("few-neighbours", "warning", message, value))
+            else:
+                remedy = "use more bins, no range (edges are then percentiles) or the empirical simulator"
+                found.append(Finding("binning", "warning", f"the histogram {changed}: {remedy}", value))
         if self.n_above_range:
             message = f"responses above the histogram's range, which are counted in its last bin: {self.n_above_range}"
             found.append(Finding("above-range", "warning", message, float(self.n_above_range)))
