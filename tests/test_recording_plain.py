@@ -590,7 +590,9 @@ def test_files_that_are_not_recordings_are_refused_in_one_line(tmp_path: Path) -
     with zipfile.ZipFile(tmp_path / "sheet.xlsx", "w") as book:
         book.writestr("[Content_Types].xml", "<Types/>")
     (tmp_path / "a_stimuli.csv").write_text("1\n")
+    (tmp_path / "notes.md").write_text("# Notes\n\nA, b.\n")
     for path, message in {
+        "notes.md": r"\(it is read as CSV; recordings are also NWB, MaxWell, CL1 or NPZ\)$",
         "none.nwb": "no such file",
         "a.npy": "got NPY, which holds one array; save several by name with numpy.savez",
         "empty.nwb": "got an empty file",
