@@ -53,9 +53,7 @@ def interruptible() -> Iterator[None]:
     def interrupt(_number: int, frame: FrameType | None) -> None:
         nonlocal waits_since_s
         waits_since_s = waits_since_s or time.monotonic()
-        # `walk_stack(None)` would walk the stack of its own caller.
-        running = () if frame is None else (each.f_code.co_filename for each, _ in walk_stack(frame))
-        if "<frozen importlib._bootstrap>" not in running or time.monotonic() > waits_since_s + _LONGEST_IMPORT_S:
+        if not _is_importing(frame) or time.monotonic() > waits_since_s + _LONGEST_IMPORT_S:
             waits_since_s = 0.0
             raise KeyboardInterrupt
         # `Thread` cannot be used: it takes a lock that the interrupted code may hold.
@@ -90,3 +88,10 @@ def handled(numbers: tuple[signal.Signals, ...], handler: Callable[..., None]) -
     finally:
         for number, old in zip(numbers, before, strict=True):
             signal.signal(number, old)
+
+
+def _is_importing(frame: FrameType | None) -> bool:
+    # `walk_stack(None)` would walk the stack of its own caller.
+    return frame is not None and any(
+        each.f_code.co_filename == "<frozen importlib._bootstrap>" for each, _ in walk_stack(frame)
+    )

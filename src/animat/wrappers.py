@@ -196,8 +196,7 @@ class YokedDelivery(NeuralWrapper[RobotState]):
     def advance(self, uniforms: Uniforms, state: State, action: Array, simulator: Neurons) -> State:
         n, other = self.inside.noise_size, state.info[_OTHER]
         other_after = self.inside.advance(uniforms[n:], other, action, simulator)  # type: ignore[arg-type]
-        begins = partial(jnp.where, jnp.logical_or(*other_after.ended))
-        next_ = jax.tree.map(begins, state.info[_START], other_after.carried)
+        next_ = _where(jnp.logical_or(*other_after.ended), state.info[_START], other_after.carried)
         return _remembering(self.inside.advance(uniforms[:n], state, action, simulator), {_OTHER: next_})
 
 
@@ -218,8 +217,7 @@ class GoalSwitch(Wrapper[RobotState]):
     def advance(self, uniforms: Uniforms, state: State, action: Array, simulator: Neurons) -> State:
         after = self.inside.advance(uniforms, state, action, simulator)
         switched = capability(self.robot, "with_goal_of")(after.robot, after.info[_GOAL])
-        is_now = partial(jnp.where, after.iteration == self.at)
-        return after._replace(robot=jax.tree.map(is_now, switched, after.robot))
+        return after._replace(robot=_where(after.iteration == self.at, switched, after.robot))
 
 
 @final
@@ -271,3 +269,7 @@ _OTHER, _START, _GOAL, _COST = "other_episode", "other_start", "other_goal", "co
 
 def _remembering(state: State, remembered: dict[str, Any]) -> State:
     return state._replace(info={**state.info, **remembered})
+
+
+def _where(condition: Array, yes: Any, no: Any) -> Any:
+    return jax.tree.map(partial(jnp.where, condition), yes, no)

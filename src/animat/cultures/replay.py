@@ -15,9 +15,10 @@ from animat.cultures.safety import Admitted, Limits
 from animat.errors import InvalidArgument, Mismatch, UnusableData, expect_at_least, in_min
 from animat.recordings.recorded_culture import RecordedCulture
 from animat.recordings.recording import Channels, Recording
+from animat.stimulation.frequency import distinct, is_same
 from animat.stimulation.patterns import Patterns
 from animat.stimulation.schedule import RESPONSE_S
-from animat.stimulation.stimulus import Stimulus, distinct, is_last_of, is_same
+from animat.stimulation.stimulus import Stimulus, is_last_of
 from animat.tables import UNKNOWN
 
 NS = 1_000_000_000

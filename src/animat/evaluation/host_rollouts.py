@@ -85,7 +85,7 @@ def paths_on_host(
         actor, alone = jax.tree.map(lambda part, number=number: part[number : number + 1], actors), key[None]
         bodies = Bodies(robot, [(seed, number)])
         observations[number] = bodies.begin()
-        for _, command, _, stepped in _iterations(environment, simulator, actor, alone, bodies, 1):
+        for command, _, stepped in _iterations(environment, simulator, actor, alone, bodies, 1):
             commands[number, lengths[number]] = command[0].reshape(robot.command_shape)
             lengths[number] += 1
             observations[number, lengths[number] :] = stepped.observation
@@ -104,12 +104,15 @@ def _run_wave(
     assert isinstance(environment.robot, HostRobot)
     bodies = _bodies(environment.robot, seeds)
     bodies.begin()
-    n, n_conditions = counts.returns.shape[1], counts.presented.shape[1]
+    n = counts.returns.shape[1]
+    going = np.ones(counts.returns.shape, bool)
+    n_conditions = counts.presented.shape[1]
     of_actor, commanded = np.indices(counts.returns.shape)[0], np.zeros_like(counts.commanded)
-    for going, command, delivered, stepped in _iterations(environment, simulator, actors, keys, bodies, n):
+    for command, delivered, stepped in _iterations(environment, simulator, actors, keys, bodies, n):
+        of_bodies = stepped.reward, stepped.terminated, stepped.ended
         if (wrong := delivered[(delivered < 0) | (delivered >= n_conditions)]).size and n_conditions:
             expect_condition(wrong[0].item(), n_conditions)
-        reward, terminated = (each.reshape(len(keys), -1)[:, :n] for each in (stepped.reward, stepped.terminated))
+        reward, terminated, ended = (each.reshape(len(keys), -1)[:, :n] for each in of_bodies)
         counts.returns[:] += np.where(going, reward, 0.0)
         counts.lengths[:] += going
         counts.terminated[:] |= going & terminated
@@ -117,16 +120,16 @@ def _run_wave(
             at = of_actor[going], delivered[:, :n][going]
             np.add.at(counts.presented, at, 1)
             np.add.at(commanded, at, command[:, :n][going])
+        going &= ~ended
     counts.commanded[:] += commanded
 
 
 def _iterations(
     environment: Environment[Any], simulator: Neurons, actors: Any, keys: Key[Array, " actors"], bodies: Bodies, n: int
-) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, StepResult]]:
+) -> Iterator[tuple[np.ndarray, np.ndarray, StepResult]]:
     """Commands, delivered conditions and results of each iteration of begun bodies; ended episodes begin again.
 
-    Of each actor's bodies the first `n` count, until they first end; a controller is asked for those only. Which of
-    them have not ended comes first.
+    Of each actor's bodies the first `n` count, until they first end; a controller is asked for those only.
     """
     shape = len(keys), len(bodies) // len(keys)
     state = _started(environment, keys, shape[1])
@@ -141,7 +144,7 @@ def _iterations(
             chosen = called.choose(*(np.asarray(each[0]) for each in (*seen, going)))
             command, state, delivered = _respond_in_jit(environment, simulator, state, chosen[None], noise)
         stepped = bodies.step(np.asarray(command).reshape(len(bodies), -1))
-        yield going[:, :n], np.asarray(command), np.asarray(delivered), stepped
+        yield np.asarray(command), np.asarray(delivered), stepped
         going &= ~stepped.ended.reshape(shape)
         if not going.any():
             break

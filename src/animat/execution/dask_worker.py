@@ -54,9 +54,7 @@ class _Core:
         began_s = time.monotonic()
         future = self._processes.submit(_answer, call)
         while not wait([future], _LOOK_EVERY_S).done:
-            task = worker.state.tasks.get(key)
-            is_wanted = task is not None and task.state == "executing"
-            if not is_wanted or worker.status.name not in ("running", "paused"):
+            if not _is_wanted(worker, key):
                 self._renew()
                 raise AnimatError("nobody is waiting for it any more")
         took_s = time.monotonic() - began_s
@@ -129,6 +127,11 @@ def versions_tag() -> str:
 def _answer(call: bytes) -> Any:
     function, args, kwargs = pickle.loads(call)
     return function(*args, **kwargs)
+
+
+def _is_wanted(worker: Any, key: object) -> bool:
+    task = worker.state.tasks.get(key)
+    return task is not None and task.state == "executing" and worker.status.name in ("running", "paused")
 
 
 def _own_cores(threads: int) -> list[int]:

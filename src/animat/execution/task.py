@@ -79,16 +79,10 @@ def _holding(lock: IO[str]) -> Iterator[None]:
     then written atomically, with the same bytes.
     """
     last_mtime, since_s = 0.0, time.monotonic()
-    while True:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            break
-        except BlockingIOError:
-            if (mtime := os.fstat(lock.fileno()).st_mtime) != last_mtime:
-                last_mtime, since_s = mtime, time.monotonic()
-            elif time.monotonic() - since_s > SILENT_S:
-                break
-        except OSError:
+    while not _has_locked(lock):
+        if (mtime := os.fstat(lock.fileno()).st_mtime) != last_mtime:
+            last_mtime, since_s = mtime, time.monotonic()
+        elif time.monotonic() - since_s > SILENT_S:
             break
         time.sleep(0.2)
     ended = threading.Event()
@@ -104,6 +98,16 @@ def _holding(lock: IO[str]) -> Iterator[None]:
     finally:
         ended.set()
         thread.join()
+
+
+def _has_locked(lock: IO[str]) -> bool:
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:
+        pass
+    return True
 
 
 def carry_out(task: Task, folder: Path, notice: Path) -> TaskResult:

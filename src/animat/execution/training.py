@@ -100,7 +100,10 @@ def train(
         missing = [group for group in groups if not _is_trained(group, folder)]
         curves = Curves(folder, groups, callbacks, _phase_of(missing, progress))
         if missing:
-            tasks = {as_range(group.members): TrainGroup(group, checkpoint_s, bool(callbacks)) for group in missing}
+            tasks = {
+                as_range(group.members): TrainGroup(group, checkpoint_s, writes_rows=bool(callbacks))
+                for group in missing
+            }
             left = [Job(name, task, cost_s=CHUNKS * len(task.group.members)) for name, task in tasks.items()]
             jobs = Jobs(left, folder, folder / UNFINISHED / "jobs", manifest["fingerprint"])
             try:

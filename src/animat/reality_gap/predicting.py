@@ -138,6 +138,7 @@ def predict(
             if number:
                 rows = {control.name: [*range(control.actor.n_actors)]}
             for name, of in rows.items():
+                # The first `ROLL_OUTS` are on the recording's simulator, each later one on a bootstrap of it.
                 from_starts = returns[:, of].reshape(len(ran), -1, rounds)
                 commanded = CommandSums(presented[:, of], total[:, of]).summed(1)
                 predictions[name] = Prediction(

@@ -31,8 +31,8 @@ DURATION = re.compile(rf"P(?=.){_DATE}(?:T(?=\d){_TIME})?", re.ASCII)
 DAY_S = 86_400.0
 UNITS_S = (365.25 * DAY_S, 365.25 / 12 * DAY_S, 7 * DAY_S, DAY_S, 3600.0, 60.0, 1.0)
 """The length of each of these, with mean years and months."""
-PERSONS = re.compile(r"\s*[^,;]+,\s*[^,;]+(?:;\s*[^,;]+,\s*[^,;]+)*").fullmatch
-SPECIES = re.compile(r"[A-Z][a-z]*\.?( [a-z]+){1,2}|https?://\S+/NCBITaxon_\d+").fullmatch
+PERSONS = re.compile(r"\s*[^,;]+,\s*[^,;]+(?:;\s*[^,;]+,\s*[^,;]+)*")
+SPECIES = re.compile(r"[A-Z][a-z]*\.?( [a-z]+){1,2}|https?://\S+/NCBITaxon_\d+")
 """Genus, species and optionally subspecies, or an address in NCBI's taxonomy."""
 
 
@@ -70,9 +70,13 @@ class Origin:
     def __post_init__(self) -> None:
         # Checked here rather than when the file is written, as spike detection takes minutes.
         checks: tuple[tuple[str, Callable[[str], object], str], ...] = (
-            ("species", SPECIES, "the name in Latin, such as Mus musculus, or its address in NCBI's taxonomy"),
+            (
+                "species",
+                SPECIES.fullmatch,
+                "the name in Latin, such as Mus musculus, or its address in NCBI's taxonomy",
+            ),
             ("age", _lengths_s, "an ISO 8601 duration such as P42D (days), P6W or P3M"),
-            ("experimenter", PERSONS, "Last, First, several separated by semicolons"),
+            ("experimenter", PERSONS.fullmatch, "Last, First, several separated by semicolons"),
             ("recorded_at", lambda text: date_of({"recorded_at": text}), LIKE_A_DATE),
         )
         for name, read, expected in checks:

@@ -10,7 +10,7 @@ from animat.errors import counted, some_of
 from animat.recordings.findings import Finding
 from animat.recordings.recording import Recording, ResponseTable
 from animat.recordings.time_quality import frequency_findings, silences, time_findings
-from animat.stimulation.stimulus import is_same
+from animat.stimulation.frequency import is_same
 from animat.tables import UNKNOWN
 
 MANY_STIMULI = 100

@@ -37,7 +37,6 @@ OTHERS = {
 }
 """First bytes of files that are often mistaken for recordings, and what to do with them."""
 HDF5_NAMES = (".nwb", ".h5", ".hdf5")
-TEXT_NAMES = (".csv", ".tsv", ".txt", ".gz", "")
 TEXT_NAMES = (".csv", ".csv.gz", ".tsv", ".txt")
 IN_FOLDERS = ("*.nwb", "*.h5", "*.npz", "*_spikes.csv", "*_spikes.csv.gz", "*_responses.csv", "*_responses.csv.gz")
 """Files in a folder that are read as recordings."""
@@ -130,7 +129,7 @@ def _read_text(path: Path, begin: bytes, stimuli_path: str | os.PathLike[str] | 
         return read_response_table(table) or read_csv(table, stimuli_path)
     except InvalidFile as error:
         if not has_hdf5_name or stimuli_path is not None:
-            if path.suffix.lower() in TEXT_NAMES:
+            if path.name.lower().endswith(TEXT_NAMES):
                 raise
             raise InvalidFile(f"{error} (it is read as CSV; recordings are also NWB, MaxWell, CL1 or NPZ)") from error
         what = "something else (perhaps text, or a server's error page); copy it again"

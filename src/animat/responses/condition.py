@@ -12,7 +12,8 @@ from pydantic import Field
 
 from animat.errors import InvalidArgument, shown
 from animat.records import Flag, Number, Whole, record
-from animat.stimulation.stimulus import NOTHING, is_same
+from animat.stimulation.frequency import is_same
+from animat.stimulation.stimulus import NOTHING
 
 _LARGEST_VALUE = 2.0**63
 RESTING = ((NOTHING,),)

@@ -11,8 +11,9 @@ from jaxtyping import Int64
 
 from animat.errors import InvalidArgument, expect_kind, within
 from animat.responses.condition import RESTING, Condition, brief_labels
+from animat.stimulation.frequency import distinct, is_same
 from animat.stimulation.protocol import Protocol
-from animat.stimulation.stimulus import NOTHING, Stimuli, distinct, is_same
+from animat.stimulation.stimulus import NOTHING, Stimuli
 from animat.tables import UNKNOWN
 
 NO_CONDITION = -1

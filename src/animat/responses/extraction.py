@@ -87,7 +87,7 @@ def extract_responses(
     assignment = replace(assignment, condition=np.where(shared, NO_CONDITION, assignment.condition))
     begins, setup_s = _blocks(source)
     assumed: tuple[Finding, ...] = ()
-    # Whether the window after each stimulus ends within the recording, which is not known of a table.
+    # Whether the window after each stimulus ends within the recording; of a table, all do.
     inside = np.ones(len(stimuli), np.bool_)
     if isinstance(source, ResponseTable):
         window_ms, assumed = _window_of(source, by, window_ms)

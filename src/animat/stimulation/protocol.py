@@ -14,9 +14,9 @@ from animat.arguments import checked_arguments
 from animat.errors import InvalidArgument, in_file
 from animat.plain_file import read_plain_text
 from animat.records import Number, Whole, json_data, record
+from animat.stimulation.frequency import distinct
 from animat.stimulation.places import NONE, Places, check_places, count_places
 from animat.stimulation.pulse import PUBLISHED_PULSE, Pulse
-from animat.stimulation.stimulus import distinct
 
 Order = Literal["blocked", "mixed"]
 

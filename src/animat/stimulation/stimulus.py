@@ -1,7 +1,4 @@
-"""A stimulus, which is one pulse on some electrodes at a time, and the table of a recording's stimuli.
-
-Frequencies, which files round and rigs compute from intervals, are the same within a millionth.
-"""
+"""A stimulus, which is one pulse on some electrodes at a time, and the table of a recording's stimuli."""
 
 from __future__ import annotations
 
@@ -147,20 +144,3 @@ class Stimuli:
 def is_last_of(presentation: Int64[np.ndarray, " stimuli"]) -> np.ndarray[Any, np.dtype[np.bool_]]:
     """Whether each pulse is the last one of its trial, by the trials' numbers; shape (stimuli,)."""
     return np.append(presentation[1:] != presentation[:-1], True)[: len(presentation)]
-
-
-def is_same(frequency_hz: Any, other_hz: Any) -> Any:
-    """Whether two frequencies are the same within a millionth, also for arrays; an unknown one (NaN) never is."""
-    return np.abs(frequency_hz - other_hz) <= 1e-6 * other_hz
-
-
-def distinct(frequency_hz: Float64[np.ndarray, " pulses"]) -> list[float]:
-    """The known frequencies, rising, each once."""
-    found: list[float] = []
-    for known_hz in np.unique(frequency_hz[~np.isnan(frequency_hz)]).tolist():
-        if found and is_same(known_hz, found[-1]):
-            # Rounded, so that it is the same number in every recording of a series.
-            found[-1] = float(f"{found[-1]:.9g}")
-        else:
-            found.append(known_hz)
-    return found

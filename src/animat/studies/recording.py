@@ -59,13 +59,15 @@ class Record(StudyTask):
         return [*series.files, out / SELECTION_FILE, out / STATE_FILE]
 
     def _copies(self, out: Path, progress: Progress) -> list[Path]:
+        copies: list[Path] = []
         recordings = read_recordings(source_files(self.study, self.base))
-        copies = [out / recording_name(recording.start_min) for recording in recordings]
-        for i, (recording, copy) in enumerate(zip(recordings, copies, strict=True)):
-            if copy in copies[:i]:
+        for i, recording in enumerate(recordings):
+            copy = out / recording_name(recording.start_min)
+            if copy in copies:
                 raise InvalidFile(
                     f"culture.files: expected recordings at different minutes, got two that would both be {copy.name}"
                 )
+            copies.append(copy)
             write_nwb(recording, copy)
             progress.update(i + 1, len(recordings))
         return copies

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import jax
@@ -91,7 +91,9 @@ def programs_with_ranges(
     environment: Environment[Any], varying: Varying, algorithm: SAC, episodes: int
 ) -> tuple[Callable[..., Any], Callable[..., Any], Callable[..., Any]]:
     """`begin`, `train_chunk` and `assess` for several policies, each with the ranges of its lesson."""
-    varied = partial(Varied[Any], environment, varying)
+
+    def varied(ranges: Ranges) -> Varied[Any]:
+        return Varied(environment, varying, ranges)
 
     def chunk(ranges: Ranges, *arguments: Any) -> Any:
         return train_chunk(varied(ranges), algorithm, *arguments)

@@ -267,9 +267,8 @@ def learn(
 ) -> Learner:
     """Take `settings.gradient_steps` gradient steps after round `index`, and average the deployed actor.
 
-    Polynomial-decay averaging (Shamir and Zhang 2013, arXiv:1212.1824), whose window grows with the training: the
-    quality of the last actor depends on luck in its last few updates; that of the average does not. With k the
-    averaging exponent and t the rounds done: average += (k + 1) / (t + k) (actor - average).
+    Polynomial-decay averaging (Shamir and Zhang 2013, arXiv:1212.1824), whose window grows with the training. With k
+    the averaging exponent and t the rounds done: average += (k + 1) / (t + k) (actor - average).
     """
     adam = _adam(settings)
     n_drawn, is_continuous = environment.n_drawn, environment.n_actions is None

@@ -73,10 +73,7 @@ def read_piece(traces: RawTraces, stimulus: Pulses, start: int, stop: int, margi
         first_stimulus -= 1
         if earliest < first_stimulus and stimulus[first_stimulus] - stimulus[first_stimulus - 1] < close:
             first_stimulus -= 1
-        n = first_stimulus - earliest
-        chosen = stimulus[earliest + np.linspace(0, n - 1, min(n, REST_PULSES)).astype(int)].tolist()
-        before = [np.median(traces.read_uv(at - rest, at - rest // 2), axis=0) for at in chosen if at >= rest]
-        rests_uv = np.array(before) if before else None
+        rests_uv = _rests_uv(traces, stimulus[earliest:first_stimulus], rest)
     if first_stimulus < last_stimulus:
         begin = min(max(int(stimulus[first_stimulus]) - rest, 0), begin)
     first, last = max(begin, 0), min(stop + margin, traces.samples)
@@ -91,6 +88,13 @@ def read_piece(traces: RawTraces, stimulus: Pulses, start: int, stop: int, margi
         is_lost = None if is_lost is None else np.pad(is_lost, (missing, (0, 0)))
     inside = stimulus[first_stimulus:last_stimulus] - begin
     return Piece(start, stop, margin, start - margin - begin, voltage_uv, is_lost, inside, first_stimulus, rests_uv)
+
+
+def _rests_uv(traces: RawTraces, stimulus: Pulses, rest: int) -> Float32[np.ndarray, "pulses channels"] | None:
+    """The voltage of each channel before a few of these pulses, evenly chosen; None if there are none."""
+    chosen = stimulus[np.linspace(0, len(stimulus) - 1, min(len(stimulus), REST_PULSES)).astype(int)]
+    before = [traces.read_uv(at - rest, at - rest // 2) for at in chosen.tolist() if at >= rest]
+    return np.array([np.median(voltage_uv, axis=0) for voltage_uv in before]) if before else None
 
 
 def _finite(
