@@ -72,8 +72,8 @@ def memory(recordings: str) -> None:
     for n in (1, 9):
         environment = Animat(Cartpole(), Thresholds(n), len(responses.conditions))
         for classes in (4, 6, 10):
-            modules = (mock.patch(f"animat.evaluation.{name}.CLASSES", classes) for name in ("commands", "optimum"))
-            with next(modules), next(modules):
+            in_commands = mock.patch("animat.evaluation.commands.CLASSES", classes)
+            with in_commands, mock.patch("animat.evaluation.optimum.CLASSES", classes):
                 (best,) = best_returns([(environment, simulator)], resolution=0.6, episodes=EPISODES)
             with_clock = f"{best.monte_carlo:.1f} ± {best.standard_error:.1f}"
             without = f"{best.without_clock:.1f} ± {best.without_clock_standard_error:.1f}"

@@ -40,6 +40,13 @@ def test_nobody_s_home_is_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
         cache_folder().mkdir(parents=True)
 
 
+def test_a_cache_with_a_name_that_the_system_refuses_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    before = jax.config.jax_compilation_cache_dir
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", f"/tmp/{'x' * 300}")
+    compilation.keep_compilations()
+    assert jax.config.jax_compilation_cache_dir == before
+
+
 @pytest.mark.parametrize(
     ("flags", "level"), [(None, 1), ("--xla_dump_to=x", 1), ("--xla_backend_optimization_level=2", None)]
 )

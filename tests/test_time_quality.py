@@ -223,9 +223,10 @@ def test_frequencies_that_contradict_the_times_cause_a_warning() -> None:
 
 
 def test_frequencies_stated_in_only_one_of_two_simultaneous_rows_can_be_compared_with_the_times() -> None:
-    # 5 and 20 Hz are stated, but stimuli come 0.1 and 0.02 s apart.
+    # 5 and 30 Hz are stated, but stimuli come 0.1 and 0.02 s apart.
     time_s = np.repeat(np.cumsum(np.repeat([0.1, 0.02], 30)), 2)
-    stated_hz = np.stack([np.repeat([5.0, 20.0], 30), np.full(60, np.nan)], axis=1).ravel()
-    stimuli = Stimuli(time_s, stated_hz, np.zeros(120), np.zeros((120, 1)), np.arange(120))
-    (found,) = frequency_findings(stimuli)
-    assert "with a stated frequency of 20 Hz are 0.02 s apart (median), not 0.05 s" in found.message
+    stated_hz = np.stack([np.repeat([5.0, 30.0], 30), np.full(60, np.nan)], axis=1)
+    for columns in ([0, 1], [1, 0]):
+        stimuli = Stimuli(time_s, stated_hz[:, columns].ravel(), np.zeros(120), np.zeros((120, 1)), np.arange(120))
+        (found,) = frequency_findings(stimuli)
+        assert "with a stated frequency of 5 Hz are 0.1 s apart (median), not 0.2 s: correct the" in found.message

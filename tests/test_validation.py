@@ -584,8 +584,9 @@ def test_the_command(recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixtu
         assert sum(each["simulators"]["histogram"]["pit"]) == pytest.approx(1)
         assert sum(each["n_fitted"]) + sum(each["n_held"]) > 250
         assert Path(each["figure"]).read_bytes().startswith(b"\x89PNG")
-    explained = printed.splitlines()[-4:-1]
-    assert all(any(f"{column}:" in line for line in explained) for column in ("marginal", "off by", "run length"))
+    explained = "".join(printed.splitlines()[-6:-1])
+    for column in ("marginal", "recorded", "bits/trial", "CRPS", "off by", "p", "lag 1", "run length"):
+        assert f"{column}: " in explained
     assert main(given) == 0
     assert capsys.readouterr().out == printed
 

@@ -17,9 +17,11 @@ from animat.report.colours import BLACK, BLUE, GREEN, GREY, ORANGE
 from animat.report.style import add_common_legend, new_figure, style_axes
 
 COLUMNS = """\
-marginal: all conditions pooled; bits, CRPS: of the held-out responses, more bits and a smaller CRPS are better
-off by: the largest error of the predicted distribution, 0 to 1, and its p by chance
-lag 1: the correlation of successive responses; run length: of runs at or above the median, in trials"""
+marginal: all conditions pooled; recorded: the held-out responses themselves
+bits/trial: log-likelihood of the commands of nine thresholds, more is better; CRPS: of the responses, less is better
+off by: the largest error of the predicted distribution, 0 to 1; p: the probability of so large an error by chance
+lag 1: the correlation of successive responses; run length: of runs at or above the median, in trials (middle 95 %)
+a simulator's lag 1 and run length are those of free runs, in which it draws all responses itself"""
 """What the rows and columns of `validation_text` are."""
 
 _COLOURS = {MARGINAL: GREY, "histogram": ORANGE, "empirical": GREEN, "memory": BLUE}
