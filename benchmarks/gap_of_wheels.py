@@ -89,7 +89,7 @@ def main(policies_in: str, recordings: str, session_in: str) -> None:
     print(f"| measured | {outcome['measured']:.1f} |")
     most = int(np.argmax([max(map(len, condition.electrodes)) for condition in calibration.conditions]))
     recorded = commands(np.zeros(len(ticks), bool))
-    print("\n| iterations | policies | by the recording's thresholds |\n|---|---|---|")
+    print("\n| iterations | by the session's thresholds | by the recording's |\n|---|---|---|")
     for start, end in itertools.pairwise(PERIODS):
         rows = ours & (delivered == most) & ticks["iteration"].between(start, end - 1)
         if rows.any():
