@@ -144,6 +144,21 @@ def test_a_study_tabulates_how_far_each_objective_was_met(tmp_path: Path) -> Non
     assert "succeeded" not in read_episodes(parts[1:])
 
 
+def test_a_robots_goals_do_not_depend_on_robots_without_goals(tmp_path: Path) -> None:
+    specs = (RobotSpec("cartpole", goal="avoid cart_position above 0.1 m"), RobotSpec("navigation"))
+    shape, files = (1, 200), []
+    margin = np.random.default_rng(1).uniform(size=shape).astype(np.float32)
+    outcome = SimpleNamespace(succeeded=margin > 0.5, margin=margin, satisfaction=100 * margin[..., None])
+    for spec, of in zip(specs, (outcome, None), strict=True):
+        ran: Any = SimpleNamespace(returns=margin, lengths=np.ones(shape), terminated=margin > 0.5, outcome=of)
+        rows = episode_rows(ran, robot=spec.name, arm="a", at_min=0.0)
+        files.append(write_episodes(tmp_path / f"{spec.name}.npz", [rows]))
+    study = Study(robots=specs, arms=(Arm("a"),))
+    (together,), (alone,) = (list(goals_met(study, read_episodes(some))) for some in (files, files[:1]))
+    assert together == alone
+    assert alone.margin == pytest.approx(np.mean(margin, dtype=np.float64), rel=1e-14)
+
+
 def test_a_closed_loop_reports_outcomes_of_whole_episodes_by_observations() -> None:
     robot = with_goal(Navigation(episode_limit=3), "reach x above 0.5 m")
     starts = [(0.0, 0.0, 0.0)] * 3

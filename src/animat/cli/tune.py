@@ -38,9 +38,9 @@ class TuneFile(JobOptions):
         cells = []
         names = ("own settings", "defaults")[: len(first_settings(tuning.study, tuning.space))]
         for final in sorted(tuned.finals, key=lambda each: -each.mean):
-            error = "" if final.standard_error is None else f"{final.standard_error:.2g}"
+            error = "" if final.standard_error is None else f"{final.standard_error:.1f}"
             name = names[final.trial] if final.trial < len(names) else f"trial {final.trial}"
-            mean = "diverged" if final.returns is None else f"{final.mean:.4g}"
+            mean = "diverged" if final.returns is None else f"{final.mean:.1f}"
             cells.append([name, mean, error, describe_settings(final.settings)])
         policies, episodes = counted(tuning.study.policies, "policy", "policies"), tuning.study.episodes
         print(f"retrained, {policies} of each, in {episodes} fresh episodes per policy:")

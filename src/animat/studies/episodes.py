@@ -92,6 +92,8 @@ def goals_met(study: Study, table: DataFrame) -> Iterator[ObjectiveMet]:
         if not isinstance(robot, RobotWithGoal):
             continue
         at = rows_where(table, robot=spec.name, over_time=False)
+        # Next to robots without goals these columns are of objects, else in single precision: sums would differ.
+        at = at.astype({name: np.float64 for name in at if name.startswith((SUCCEEDED, MARGIN, SATISFACTION))})
         for (arm, agent, at_min), rows in at.groupby(["arm", "agent", "at_min"], sort=False):
             met = len(rows), float(rows[SUCCEEDED].mean()), float(rows[MARGIN].mean())
             for i, objective in enumerate(robot.goal.objectives):
