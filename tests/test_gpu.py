@@ -35,7 +35,7 @@ from animat.studies.folder import describe_study
 from animat.studies.run import plan_study
 from animat.studies.source import Source
 from animat.studies.toml import read_study
-from animat.studies.training import TrainGroup as TrainArm
+from animat.studies.training import TrainArm
 from animat.training.folder import describe
 from animat.training.group import Group, SideBySide, train_groups
 from animat.training.lessons import Lesson

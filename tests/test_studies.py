@@ -51,7 +51,7 @@ from animat.studies.captions import CULTURE, ROBOT
 from animat.studies.folder import claim_folder, controls_file, describe_study, episodes_file, hash_files
 from animat.studies.paper import PRINTED, paper_study
 from animat.studies.pictures import CulturePictures
-from animat.studies.recording import Fit, Record
+from animat.studies.recording import FitSimulators, MakeRecordings
 from animat.studies.run import StudyRun, plan_study, run_study
 from animat.studies.source import Source
 from animat.studies.specification import Arm, Compared, RobotSpec, Simulators, Study
@@ -59,7 +59,7 @@ from animat.studies.toml import read_study, study_to_toml
 from animat.studies.training import training_of
 from animat.training.lessons import read_lessons
 from animat.training.policy import Policy
-from animat.tuning.tasks import Fit as FitOfTuning
+from animat.tuning.tasks import FitVariant
 from animat.writing import LOCK, exclusive_lock
 from cultures import small_culture
 from synthetic_recordings import synthetic_recording, write_synthetic_series
@@ -316,11 +316,11 @@ def test_a_specification_can_be_corrected_before_anything_is_made(tmp_path: Path
 def test_a_specification_can_be_corrected_after_its_first_job_was_stopped(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def stop(self: Record, folder: Path, progress: Progress) -> list[Path]:
+    def stop(self: MakeRecordings, folder: Path, progress: Progress) -> list[Path]:
         progress.update(0.5, 1)
         raise AnimatError("stopped")
 
-    monkeypatch.setattr(Record, "make", stop)
+    monkeypatch.setattr(MakeRecordings, "make", stop)
     # Every other job needs the recordings.
     study = replace(read_study(TINY), arms=(Arm("1 threshold"),), comparisons=())
     for seed in (1, 2):
@@ -365,7 +365,7 @@ def test_a_virtual_culture_s_recordings_are_the_same_files_wherever_it_was_kille
     study = Study(culture=Source(sessions=2, interval_min=2.0, trials=2))
 
     def record(name: str) -> Receipt:
-        done = carry_out(Record(study, tmp_path), tmp_path / name, tmp_path / "receipts")
+        done = carry_out(MakeRecordings(study, tmp_path), tmp_path / name, tmp_path / "receipts")
         return Receipt("record", "study", {}, done.files)
 
     undisturbed = record("undisturbed")
@@ -448,7 +448,7 @@ def test_recordings_whose_names_would_be_one_are_refused(tmp_path: Path) -> None
         write_nwb(synthetic_recording(1, start_min=start_min, patterns=5, channels=16), tmp_path / f"{i}.nwb")
     study = Study(culture=Source("files", files=("0.nwb", "1.nwb")))
     with pytest.raises(InvalidFile, match=r"two that would both be recording_1\.23457e"):
-        Record(study, tmp_path).run(tmp_path / "study", Silent())
+        MakeRecordings(study, tmp_path).run(tmp_path / "study", Silent())
 
 
 def test_recordings_that_changed_are_noticed(tmp_path: Path) -> None:
@@ -1009,26 +1009,26 @@ def test_a_comparison_moved_to_another_minute_is_reported(tmp_path: Path) -> Non
         arms=PAIR,
         comparisons=(moved, replace(moved, name="b", at_min=30.0)),
     )
-    Record(study, tmp_path).run(tmp_path / "study", Silent())
-    kept, _ = Fit(study).run(tmp_path / "study", Silent())
+    MakeRecordings(study, tmp_path).run(tmp_path / "study", Silent())
+    kept, _ = FitSimulators(study).run(tmp_path / "study", Silent())
     (finding,) = [finding for finding in load_timeline(kept).findings if finding.name == "comparison-minute"]
     assert finding.message == "before and after was requested at 29 min and is made on the recording at 30 min"
     with pytest.raises(InvalidArgument, match="at_min"):
-        Fit(replace(study, comparisons=(replace(moved, at_min=99.0),))).run(tmp_path / "study", Silent())
+        FitSimulators(replace(study, comparisons=(replace(moved, at_min=99.0),))).run(tmp_path / "study", Silent())
 
 
 def test_recordings_that_leave_nothing_to_choose_are_refused(tmp_path: Path) -> None:
     write_synthetic_series(1, tmp_path / "made", sessions=1, patterns=10, channels=16)
     one = Study(culture=Source("files", files=("made",)), simulators=Simulators(conditions="all"))
-    Record(one, tmp_path).run(tmp_path / "study", Silent())
+    MakeRecordings(one, tmp_path).run(tmp_path / "study", Silent())
     with pytest.raises(UnusableData, match=r"simulators\.conditions: expected two or more .* got one \(all\)"):
-        Fit(one).run(tmp_path / "study", Silent())
+        FitSimulators(one).run(tmp_path / "study", Silent())
     knowing = replace(one, simulators=Simulators(conditions="all", allow=("one-condition",)))
-    kept, _ = Fit(knowing).run(tmp_path / "study", Silent())
+    kept, _ = FitSimulators(knowing).run(tmp_path / "study", Silent())
     assert len(load_timeline(kept).conditions) == 1
     with pytest.raises(UnusableData, match=r"simulators\.conditions: expected two or more"):
-        FitOfTuning(one).run(tmp_path / "study", Silent())
-    (kept,) = FitOfTuning(knowing).run(tmp_path / "study", Silent())
+        FitVariant(one).run(tmp_path / "study", Silent())
+    (kept,) = FitVariant(knowing).run(tmp_path / "study", Silent())
     assert len(load_timeline(kept).conditions) == 1
 
 
@@ -1090,11 +1090,11 @@ def test_recordings_at_hand_are_copied_and_fitted(tmp_path: Path) -> None:
     write_synthetic_series(1, tmp_path / "made", sessions=2, interval_min=30.0, patterns=10, channels=16)
     study = Study(culture=Source("files", files=("made",)), simulators=Simulators(kind="empirical"))
     folder = tmp_path / "study"
-    copies = Record(study, tmp_path).run(folder, Silent())
+    copies = MakeRecordings(study, tmp_path).run(folder, Silent())
     assert [path.name for path in copies] == ["recording_0000_min.nwb", "recording_0030_min.nwb"]
     for copy in copies:
         assert read_recording(copy).equals(read_recording(tmp_path / "made" / copy.name))
-    kept, responses = Fit(study).run(folder, Silent())
+    kept, responses = FitSimulators(study).run(folder, Silent())
     timeline = load_timeline(kept)
     fitted = fit_timeline(extract_series(read_recordings(tmp_path / "made")), kind="empirical")
     for one, other in zip(jax.tree.leaves(timeline.simulators), jax.tree.leaves(fitted.simulators), strict=True):

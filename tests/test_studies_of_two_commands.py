@@ -19,13 +19,13 @@ from animat.recordings.reading import read_recordings
 from animat.responses.extraction import extract_series
 from animat.robots import Wheels
 from animat.stimulation.protocol import TWO_COMMANDS
-from animat.studies.recording import Fit, Record, controllability
+from animat.studies.recording import FitSimulators, MakeRecordings, controllability
 from animat.studies.run import run_study
 from animat.studies.source import Source
 from animat.studies.specification import Arm, Compared, RobotSpec, Simulators, Study
 from animat.studies.task import study_seed
 from animat.studies.toml import read_study, study_to_toml
-from animat.studies.training import TrainGroup
+from animat.studies.training import TrainArm
 from animat.training.lessons import Lesson
 from animat.training.policy import Policy
 from animat.training.settings import SAC
@@ -51,8 +51,8 @@ STUDY = Study(
 
 
 def fitted(folder: Path) -> Path:
-    Record(STUDY, HERE).run(folder, Silent())
-    return Fit(STUDY).run(folder, Silent())[0]
+    MakeRecordings(STUDY, HERE).run(folder, Silent())
+    return FitSimulators(STUDY).run(folder, Silent())[0]
 
 
 @pytest.mark.oracle
@@ -66,7 +66,7 @@ def test_a_study_s_policies_are_those_of_the_same_training_by_hand(tmp_path: Pat
     spec, arm = STUDY.robots[0], STUDY.arms[1]
     for member in range(2):
         # As many side by side as there are by hand: else sums are rounded otherwise.
-        TrainGroup(STUDY, spec, arm, (member,)).run(tmp_path, Silent())
+        TrainArm(STUDY, spec, arm, (member,)).run(tmp_path, Silent())
     by_hand = Training(
         robot=Wheels(),
         mapping=mapping_named("1-threshold"),

@@ -28,18 +28,18 @@ from animat.report.results import ComparedReturns, Results, Score, StudyOptimum
 from animat.responses.extraction import extract_series
 from animat.robots import Navigation
 from animat.studies.episodes import COLUMNS, RANDOM, Paths, episode_rows, mean_returns, read_episodes, write_episodes
-from animat.studies.evaluating import Evaluate
+from animat.studies.evaluating import EvaluateArm
 from animat.studies.folder import RESULTS, controls_file, episodes_file, optima_file, table_file
 from animat.studies.optima import FindOptima, read_optima
 from animat.studies.pictures import _courses, _minutes_in_training, paths_rows
-from animat.studies.recording import Fit, Record
+from animat.studies.recording import FitSimulators, MakeRecordings
 from animat.studies.report_tables import optima_table
 from animat.studies.results import read_typed, write_table, write_typed
 from animat.studies.source import Source
 from animat.studies.specification import Arm, Compared, RobotSpec, Study, mapping_label
 from animat.studies.tabulating import References, Tabulate, _comparisons, _controls, _finite, _optimum_error, _scores
 from animat.studies.task import study_seed
-from animat.studies.training import TrainGroup
+from animat.studies.training import TrainArm
 from animat.training.policy import Policy, load_policies
 from animat.wrappers import ShuffledDelivery
 
@@ -248,10 +248,10 @@ def test_policies_are_evaluated_as_they_are_trained_on_the_minute_s_own_neurons(
     )
     (spec,) = study.robots
     for task in (
-        Record(study, HERE),
-        Fit(study),
-        TrainGroup(study, spec, arm, (0, 1)),
-        Evaluate(study, spec, arm),
+        MakeRecordings(study, HERE),
+        FitSimulators(study),
+        TrainArm(study, spec, arm, (0, 1)),
+        EvaluateArm(study, spec, arm),
     ):
         task.run(tmp_path, Silent())
     got = read_episodes([episodes_file(tmp_path, spec, arm)])
@@ -292,8 +292,8 @@ FEW = Study(
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("few")
-    Record(FEW, HERE).run(folder, Silent())
-    Fit(FEW).run(folder, Silent())
+    MakeRecordings(FEW, HERE).run(folder, Silent())
+    FitSimulators(FEW).run(folder, Silent())
     return folder
 
 

@@ -21,7 +21,7 @@ from animat.recordings.recording import Recording
 from animat.responses.condition import Condition
 from animat.stimulation.protocol import Order, Presentation, Protocol
 from animat.stimulation.schedule import make_schedule
-from animat.studies.recording import Fit
+from animat.studies.recording import FitSimulators
 from animat.studies.specification import Simulators
 from animat.studies.toml import read_study
 from test_responses import recording
@@ -146,7 +146,7 @@ def test_a_study_reports_the_memory_that_its_simulators_lack(
     """Not of recordings in blocks, from which nothing else can be made."""
     series(tmp_path / "recordings", a_recording(0, order, memory=True))
     study = replace(read_study(TINY), simulators=Simulators(kind=kind), comparisons=())
-    kept, _ = Fit(study).run(tmp_path, Silent())
+    kept, _ = FitSimulators(study).run(tmp_path, Silent())
     warnings = [each.message for each in load_timeline(kept).findings if each.name == "no-memory"]
     assert len(warnings) == found and all('(simulators.kind = "memory")' in message for message in warnings)
 

@@ -38,7 +38,7 @@ from animat.tuning.results import BEST, HISTORY, RESULTS, Final, TuningResult, w
 from animat.tuning.run import tune
 from animat.tuning.search import JOURNAL, Trial, read_journal
 from animat.tuning.specification import Range, Tuning, first_settings, read_tuning, tuning_of, with_settings
-from animat.tuning.tasks import Trials, group_by_shape
+from animat.tuning.tasks import TrialsSideBySide, group_by_shape
 from synthetic_recordings import synthetic_recording
 
 pytest.importorskip("optuna", reason="animat tune needs the extra [tune]")
@@ -119,15 +119,15 @@ def test_a_trial_that_was_stopped_between_two_chunks_goes_on_from_there(
     finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(tasks, "CHECKPOINT_S", -1.0)
-    trained, train = [], Trials.train
+    trained, train = [], TrialsSideBySide.train
 
-    def fails_now_and_then(self: Trials, index: int, *simulators: Any) -> float:
+    def fails_now_and_then(self: TrialsSideBySide, index: int, *simulators: Any) -> float:
         trained.append(index)
         if len(trained) in (7, 40, 90):
             raise AnimatError("out of power")
         return train(self, index, *simulators)
 
-    monkeypatch.setattr(Trials, "train", fails_now_and_then)
+    monkeypatch.setattr(TrialsSideBySide, "train", fails_now_and_then)
     for _ in range(3):
         with pytest.raises(AnimatError, match="out of power"):
             run(tmp_path / "out")
@@ -161,7 +161,7 @@ def test_no_two_policies_of_a_final_meet_the_same_episodes(finished: Path, monke
         return SimpleNamespace(returns=np.zeros((1, episodes)))
 
     monkeypatch.setattr(tasks, "roll_out", roll_out)
-    monkeypatch.setattr(Trials, "train", lambda *_: None)
+    monkeypatch.setattr(TrialsSideBySide, "train", lambda *_: None)
     study = read_tuning(TINY).study
     settings, place = first_settings(study, read_tuning(TINY).space)[0], "finals-of-six"
     trial = Trial(0, settings, "complete", (), ())
@@ -239,7 +239,7 @@ def test_settings_as_arrays_train_as_those_that_are_compiled_in(mapping: str | N
     training = Training("navigation", mapping, policies=2, iterations=8 * 12 * CHUNKS, seed=4)
     simulator = None if mapping is None else synthetic_simulator()
     timeline = None if mapping is None else fit_timeline([extract_responses(synthetic_recording(1, patterns=40))])
-    together = Trials(training, timeline, algorithms, (0, 1))
+    together = TrialsSideBySide(training, timeline, algorithms, (0, 1))
     together.train(0, simulator)
     # The diagnosis would be by the usual settings.
     assert np.isnan(together.curve[0][:, CURVE.index("entropy") :]).all() and np.isfinite(together.curve[0][:, 0]).all()

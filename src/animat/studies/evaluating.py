@@ -24,7 +24,7 @@ from animat.training.policy import Policy
 
 
 @dataclass(frozen=True)
-class Evaluate(StudyTask):
+class EvaluateArm(StudyTask):
     """Run an arm's policies at the minutes of its comparisons, at every recording, and once to record paths."""
 
     sizes = ("policies", "episodes", "episodes_over_time")
@@ -56,7 +56,7 @@ class Evaluate(StudyTask):
 
 
 @dataclass(frozen=True)
-class Control(StudyTask):
+class RunControls(StudyTask):
     """Run the controls of a mapping on a robot: that of the arm `plain`, whose policies are used if it `is_usual`.
 
     The best coupling is run at the last recording only, as its search takes as long as all other controls together.

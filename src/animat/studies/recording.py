@@ -29,7 +29,7 @@ JOB = "record"
 
 
 @dataclass(frozen=True)
-class Record(StudyTask):
+class MakeRecordings(StudyTask):
     """Make the recordings as NWB; the specification's file names are relative to `base`."""
 
     sizes = ("culture.trials", "culture.pulses")
@@ -73,7 +73,7 @@ class Record(StudyTask):
         return copies
 
 
-class Fit(StudyTask):
+class FitSimulators(StudyTask):
     """Extract the responses of all recordings and fit a simulator to each."""
 
     sizes = ("culture.sessions", "culture.trials", "simulators.bins")

@@ -88,7 +88,7 @@ def plan_study(study: Study, base: Path) -> list[Job]:
     # Tasks import JAX, which the command line should not load.
     from animat.studies.pictures import CulturePictures, RobotPictures
     from animat.studies.publishing import Publish
-    from animat.studies.recording import JOB, Fit, Record
+    from animat.studies.recording import JOB, FitSimulators, MakeRecordings
     from animat.studies.tabulating import Tabulate
 
     jobs: list[Job] = []
@@ -98,8 +98,8 @@ def plan_study(study: Study, base: Path) -> list[Job]:
         # The time between recordings is computed too.
         recorded_s = culture.sessions * (_S_PER_MIN * culture.interval_min if culture.kind == "virtual" else 0.3)
         jobs += [
-            Job(JOB, Record(study, base), (), 2 + recorded_s),
-            Job("fit", Fit(study), (JOB,), 3),
+            Job(JOB, MakeRecordings(study, base), (), 2 + recorded_s),
+            Job("fit", FitSimulators(study), (JOB,), 3),
             Job("pictures/culture", CulturePictures(study), (JOB, "fit"), 15),
         ]
         neurons = ("fit",)
@@ -117,9 +117,9 @@ def plan_study(study: Study, base: Path) -> list[Job]:
 
 def _jobs_of(study: Study, spec: RobotSpec, neurons: tuple[str, ...]) -> list[Job]:
     """The jobs whose results are tabulated for a robot: training, evaluation, controls and optimal returns."""
-    from animat.studies.evaluating import Control, Evaluate
+    from animat.studies.evaluating import EvaluateArm, RunControls
     from animat.studies.optima import FindOptima, kinds_of
-    from animat.studies.training import TrainGroup
+    from animat.studies.training import TrainArm
     from animat.training.group import split_groups
 
     jobs: list[Job] = []
@@ -129,16 +129,16 @@ def _jobs_of(study: Study, spec: RobotSpec, neurons: tuple[str, ...]) -> list[Jo
         for members in split_groups(study.policies):
             names.append(f"train/{spec.name}/{arm.slug}/p{members[0]}")
             trained_s = spec.trained_for * len(members) / ITERATIONS_PER_S if arm.trained else 0.0
-            jobs.append(Job(names[-1], TrainGroup(study, spec, arm, members), needs, 4 + trained_s))
+            jobs.append(Job(names[-1], TrainArm(study, spec, arm, members), needs, 4 + trained_s))
         # The minute is the last recording's, even without neurons.
-        task = Evaluate(study, spec, arm)
+        task = EvaluateArm(study, spec, arm)
         jobs.append(Job(f"evaluate/{spec.name}/{arm.slug}", task, (*names, *neurons), 4))
     for kind in kinds_of(study):
         # The most plainly trained arm of a kind represents it.
         arms = study.arms_of(kind)
         plain = max(arms, key=lambda arm: (arm.trained, arm.delivery == "chosen", arm.shadowing is True))
         name = f"controls/{spec.name}/{kind.thresholds}"
-        jobs.append(Job(name, Control(study, spec, plain), (*groups[plain], *neurons), 15))
+        jobs.append(Job(name, RunControls(study, spec, plain), (*groups[plain], *neurons), 15))
     resolution = spec.optimum_resolution or study.optimum_resolution
     cost_s = 40 * resolution ** len(spec.robot().observation_spec) + 10
     jobs.append(Job(f"optimum/{spec.name}", FindOptima(study, spec), neurons, cost_s))

@@ -21,7 +21,7 @@ from animat.training.specification import Training
 
 
 @dataclass(frozen=True)
-class TrainGroup(StudyTask, TrainingTask):
+class TrainArm(StudyTask, TrainingTask):
     """Train some policies of an arm on a robot, resuming where a killed run stopped."""
 
     sizes = ("algorithm",)

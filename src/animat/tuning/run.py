@@ -21,7 +21,7 @@ from animat.folders import with_fingerprint
 from animat.process import own_cores
 from animat.progress import Part, Progress, Silent
 from animat.studies.folder import OWN_FOLDERS, RECEIPTS, claim_folder, describe_study, hash_sources
-from animat.studies.recording import JOB, Record
+from animat.studies.recording import JOB, MakeRecordings
 from animat.studies.run import ITERATIONS_PER_S, check_custom
 from animat.studies.task import draw_seed
 from animat.training.group import split_groups
@@ -29,7 +29,7 @@ from animat.training.specification import CHUNKS
 from animat.tuning.results import Final, TuningResult, write_results
 from animat.tuning.search import Search, Trial, expect_optuna, read_journal, write_journal
 from animat.tuning.specification import Tuning, choices_of, first_settings, with_settings
-from animat.tuning.tasks import Fit, TrainTrials, group_by_shape, returns_file, timeline_file
+from animat.tuning.tasks import FitVariant, TrainTrials, group_by_shape, returns_file, timeline_file
 
 MANIFEST = "tune.json"
 FINALS = "finals"
@@ -96,8 +96,8 @@ class _Run:
         names = ("simulator", "conditions", "readouts")
         choices = [choices_of(name, space, study) for name in names]
         variants = [with_settings(study, dict(zip(names, chosen, strict=True))) for chosen in product(*choices)]
-        fits = [Job(f"fit/{timeline_file(each).stem}", Fit(each), (JOB,), 3) for each in variants]
-        self._run_jobs([Job(JOB, Record(study, base), (), 5), *fits], RECEIPTS, 20, "recordings and simulators")
+        fits = [Job(f"fit/{timeline_file(each).stem}", FitVariant(each), (JOB,), 3) for each in variants]
+        self._run_jobs([Job(JOB, MakeRecordings(study, base), (), 5), *fits], RECEIPTS, 20, "recordings and simulators")
 
     def search(self) -> list[Trial]:
         """Run all trials, reusing those in the journal."""

@@ -45,7 +45,7 @@ def timeline_file(study: Study) -> Path:
     return Path("simulators") / f"{simulators.kind}{details and '-' + digest}.safetensors"
 
 
-class Fit(StudyTask):
+class FitVariant(StudyTask):
     """Fit a simulator of the study's kind to the responses of each recording."""
 
     sizes = ("culture.sessions", "culture.trials", "simulators.bins")
@@ -75,7 +75,7 @@ def programs(environment: Environment[Any], algorithm: SAC) -> tuple[Callable[..
     return jit_side_by_side(beginning), jit_side_by_side(chunk, (0, 0, None, None, None), donate_argnums=1)
 
 
-class Trials(SideBySide):
+class TrialsSideBySide(SideBySide):
     """The policies of several trials during training, one group per trial; their settings differ only in `NUMBERS`.
 
     The numbers of each trial's policies, `members`, decide their random numbers: all trials use the same ones.
@@ -149,7 +149,7 @@ class TrainTrials(StudyTask):
         training = replace(training, seed=self.seeds[0], policies=len(self.members))
         timeline = _timeline(folder, studies[0])
         judging = _timeline(folder, _judging_study(self.study, studies[0]))
-        together = Trials(training, timeline, algorithms, self.members)
+        together = TrialsSideBySide(training, timeline, algorithms, self.members)
 
         numbers = ",".join(str(trial.trial) for trial in self.trials)
         checkpoint = place / f"t{numbers}-p{self.members[0]}-to-{last}-of-{CHUNKS}.npz"
