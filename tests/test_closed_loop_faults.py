@@ -21,7 +21,7 @@ import pytest
 
 from animat.cli import main
 from animat.closed_loop.agents import Agent, OneCondition
-from animat.closed_loop.log import LogWriter, Record, read_log
+from animat.closed_loop.log import LogRecord, LogWriter, read_log
 from animat.closed_loop.running import run_session
 from animat.closed_loop.session import LOG_FILE, Session, read_session, recover_session
 from animat.closed_loop.stretch import check_answer
@@ -1010,7 +1010,7 @@ def test_a_session_that_was_logged_before_stretches_were_is_read(tmp_path: Path)
     for words, times_s, channels in session.log:
         kept = {name: value for name, value in words.items() if name not in ("stretch", "stimuli")}
         seen = {"stimuli": words["stimuli"]} if words["kind"] == "seen" else {}
-        log.append(Record(kept | seen, times_s, channels))
+        log.append(LogRecord(kept | seen, times_s, channels))
     log.close()
     old = recover_session(tmp_path / "old")
     assert list(old.ticks) == list(session.ticks)
@@ -1021,7 +1021,7 @@ def test_a_log_cut_off_anywhere_is_whole_up_to_there(tmp_path: Path) -> None:
     log = LogWriter(tmp_path / LOG_FILE, {"kind": "header"})
     header_ends = (tmp_path / LOG_FILE).stat().st_size
     rng = np.random.default_rng(1)
-    written = [Record({"n": n}, np.sort(rng.random(n)), rng.integers(0, 9, n)) for n in range(6)]
+    written = [LogRecord({"n": n}, np.sort(rng.random(n)), rng.integers(0, 9, n)) for n in range(6)]
     ends = []
     for record in written:
         log.append(record)

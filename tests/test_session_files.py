@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 
 from animat.cli import main
 from animat.closed_loop.agents import Agent, OneCondition
-from animat.closed_loop.log import LogWriter, Record, read_log
+from animat.closed_loop.log import LogRecord, LogWriter, read_log
 from animat.closed_loop.running import run_session
 from animat.closed_loop.session import LOG_FILE, Session, read_session, recover_session
 from animat.cultures.budget import Account, Budget
@@ -181,7 +181,7 @@ def long_log(folder: Path, ticks: int) -> None:
         tick = last["tick"] | {"number": n, "iteration": n, "pulse_time_s": [n / 64], "read_after_s": n / 64}
         row = [80.0, 3, n, [100, 101, 102]]
         words = last | {"stretch": n, "start_s": n / 64, "duration_s": 0.01, "stimuli": [row], "tick": tick}
-        log.append(Record(words, n / 64 + spikes_s, channels))
+        log.append(LogRecord(words, n / 64 + spikes_s, channels))
     log.close()
 
 

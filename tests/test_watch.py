@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from animat.closed_loop.log import LogWriter, Record, read_log
+from animat.closed_loop.log import LogRecord, LogWriter, read_log
 from animat.closed_loop.session import LOG_FILE, read_session
 from animat.closed_loop.tick import STOP_FILE
 from animat.errors import InvalidArgument, InvalidFile
@@ -176,7 +176,7 @@ def test_a_log_is_followed_while_it_grows(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(InvalidFile, match="cannot be read"):
         view.about()
     writer = LogWriter(tmp_path / LOG_FILE, log.header)
-    writer.append(Record({"kind": "event", "what": "culture", "message": "gone", "asked_at_s": 1.5}))
+    writer.append(LogRecord({"kind": "event", "what": "culture", "message": "gone", "asked_at_s": 1.5}))
     ticks, end_s, moved_at = 0, 0.0, None
     for number, record in enumerate(log):
         fields = record.fields
@@ -304,7 +304,7 @@ def test_records_are_found_a_slice_at_a_time(folder: Path, tmp_path: Path) -> No
     log = read_log(folder / LOG_FILE)
     writer = LogWriter(tmp_path / LOG_FILE, log.header)
     for _ in range(3000):
-        writer.append(Record({"kind": "nothing"}))
+        writer.append(LogRecord({"kind": "nothing"}))
     writer.close()
     tail, looks = Tail(tmp_path / LOG_FILE), 1
     while not tail.grow(0.0):
@@ -334,7 +334,7 @@ def test_a_length_beyond_all_records_is_damage_and_is_not_read(
 ) -> None:
     log = read_log(folder / LOG_FILE)
     writer = LogWriter(tmp_path / LOG_FILE, log.header)
-    writer.append(Record({"kind": "nothing", "text": "x" * 100_000}))
+    writer.append(LogRecord({"kind": "nothing", "text": "x" * 100_000}))
     writer.close()
     monkeypatch.setattr("animat.watch.tail._MOST_BYTES", 90_000)
     tail = Tail(tmp_path / LOG_FILE)

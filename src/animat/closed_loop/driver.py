@@ -16,7 +16,7 @@ from jaxtyping import Float64
 
 from animat.closed_loop.adaptive import AdaptiveThresholds
 from animat.closed_loop.agents import Agent
-from animat.closed_loop.log import Record
+from animat.closed_loop.log import LogRecord
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.runner import runner_of
 from animat.closed_loop.stretch import Stretch, check_answer, ending_of, read_response, request_fields, stretch_record
@@ -62,11 +62,11 @@ class Driver:
     is_stopped: bool = False
     deadline: tuple[float, str] = float("inf"), "nobody"
     request: dict[str, Any] | None = None
-    unfinished: Record | None = None
+    unfinished: LogRecord | None = None
 
     def __post_init__(self) -> None:
         loop, culture = self.loop, self.culture
-        self.records: deque[Record] = deque()
+        self.records: deque[LogRecord] = deque()
         self._rng = np.random.default_rng([self.seed, 21])
         self._runner = runner_of(loop.robot, robot_generator(self.seed))
         if any(agent.switch_at is not None for agent in self.agents):
@@ -154,7 +154,7 @@ class Driver:
         observation = self._ask("the robot", "robot", lambda: self._runner.reset(turn))
         if not np.all(np.isfinite(observation)):
             raise Stop(Ending("robot", f"the robot starts at {observation.tolist()}"))
-        self.records.append(Record({"kind": "start", "episode": episode, "observation": observation.tolist()}))
+        self.records.append(LogRecord({"kind": "start", "episode": episode, "observation": observation.tolist()}))
         return observation
 
     def _warm_up(self, agent: Agent, episode: int, rounds: int) -> None:
@@ -369,7 +369,7 @@ class Driver:
     def _log_fault(self, ending: Ending, request: dict[str, Any], **more: Any) -> None:
         """Log a request that has no usable answer."""
         fields = {"kind": "event", "what": ending.by, "message": ending.message, **request, **more}
-        self.records.append(Record(fields))
+        self.records.append(LogRecord(fields))
 
     def _ask(self, who: str, by: EndedBy, ask: Callable[[], T]) -> T:
         """The answer of the robot or an agent, by a deadline; whatever it raises ends the session."""

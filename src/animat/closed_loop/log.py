@@ -42,7 +42,7 @@ _BLOCK_SPIKES = 2**20
 _NO_TIMES, _NO_CHANNELS = np.empty(0, np.float64), np.empty(0, np.int64)
 
 
-class Record(NamedTuple):
+class LogRecord(NamedTuple):
     """One record: its fields and its spikes."""
 
     fields: dict[str, Any]
@@ -68,12 +68,12 @@ class LogWriter:
             # Nobody recovers the session while it is running.
             is_locked(path.parent, self._file)
             self._write(MAGIC)
-            self.append(Record(self._header))
+            self.append(LogRecord(self._header))
             self.sync()
             sync_folder(path.parent)
             stack.pop_all()
 
-    def append(self, record: Record) -> None:
+    def append(self, record: LogRecord) -> None:
         """Write a record; if that raises OSError, the file ends with the record before it."""
         fields = json.dumps(record.fields).encode()
         spikes = record.spike_times_s.astype("<f8").tobytes() + record.spike_channels.astype("<i4").tobytes()
@@ -125,13 +125,13 @@ class Log:
     def __len__(self) -> int:
         return len(self.places) - 1
 
-    def __getitem__(self, index: int) -> Record:
+    def __getitem__(self, index: int) -> LogRecord:
         number = range(len(self))[index]
         with open_file(self.path) as file:
             file.seek(self.places[number])
             return parse_record(self.path, file.read(self.places[number + 1] - self.places[number]))
 
-    def __iter__(self) -> Iterator[Record]:
+    def __iter__(self) -> Iterator[LogRecord]:
         return (parse_record(self.path, data) for data in self._data())
 
     def fields(self) -> Iterator[dict[str, Any]]:
@@ -199,9 +199,9 @@ def end_of_intact(file: BinaryIO, at: int, n_bytes: int) -> int | None:
     return int(end)
 
 
-def parse_record(path: Path, data: bytes) -> Record:
+def parse_record(path: Path, data: bytes) -> LogRecord:
     """A record from its bytes, which are intact; raises InvalidFile, naming `path`, if its fields are not JSON."""
-    return Record(parse_fields(path, data), *_spikes(data))
+    return LogRecord(parse_fields(path, data), *_spikes(data))
 
 
 def _spikes(data: bytes) -> SpikeBlock:

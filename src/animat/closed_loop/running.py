@@ -24,7 +24,7 @@ import numpy as np
 from animat.closed_loop.agents import Agent, interleave
 from animat.closed_loop.driver import Driver
 from animat.closed_loop.header import FORMAT, observed_columns, read_header
-from animat.closed_loop.log import LogWriter, Record
+from animat.closed_loop.log import LogRecord, LogWriter
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.outline import Outline
 from animat.closed_loop.session import LOG_FILE, Session, expect_no_session
@@ -230,7 +230,7 @@ class _Supervisor:
         request = self._driver.request
         if request is not None and request["stretch"] > self._logged_request:
             # Known even if the answer never comes, or the program is killed meanwhile.
-            self._log.append(Record({"kind": "asked", **request}))
+            self._log.append(LogRecord({"kind": "asked", **request}))
             self._logged_request = request["stretch"]
         if time.monotonic() - self._synced > _SYNC_S:
             self._log.sync()
@@ -252,7 +252,7 @@ class _Supervisor:
             if unfinished is not None and unfinished.fields["stretch"] > self._outline.answered:
                 self._log.append(unfinished)
             fields = {"kind": "end", "by": ending.by, "message": ending.message, "left_out": left_out}
-            self._log.append(Record(fields))
+            self._log.append(LogRecord(fields))
             self._log.sync()
         except OSError as error:
             left, why = len(self._driver.records), error.strerror or str(error)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-from animat.closed_loop.log import Record
+from animat.closed_loop.log import LogRecord
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.tick import Ending
 from animat.cultures.base import Culture
@@ -52,11 +52,11 @@ def _rows_of(stimuli: Sequence[Stimulus]) -> list[list[Any]]:
     return [[s.frequency_hz, s.pattern, s.presentation, list(s.electrodes)] for s in stimuli]
 
 
-def stretch_record(stretch: Stretch, stimuli: Sequence[Stimulus], tick: dict[str, Any] | None) -> Record:
+def stretch_record(stretch: Stretch, stimuli: Sequence[Stimulus], tick: dict[str, Any] | None) -> LogRecord:
     """The log record of a stretch of time."""
     span = {"stretch": stretch.number, "start_s": stretch.start_s, "duration_s": stretch.duration_s}
     fields = {"kind": "seen", **span, "stimuli": _rows_of(stimuli), "tick": tick}
-    return Record(fields, stretch.spike_times_s, stretch.spike_channels)
+    return LogRecord(fields, stretch.spike_times_s, stretch.spike_channels)
 
 
 def check_answer(

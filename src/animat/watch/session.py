@@ -15,7 +15,7 @@ import numpy as np
 from PIL import Image
 
 from animat.closed_loop.header import Header, read_header
-from animat.closed_loop.log import Record
+from animat.closed_loop.log import LogRecord
 from animat.closed_loop.session import LOG_FILE, RECORDING_FILE
 from animat.closed_loop.tick import STOP_FILE
 from animat.coding.mapping import Thresholds
@@ -211,14 +211,14 @@ class SessionView(View):
                 return span
         return None
 
-    def _between(self, from_s: float, to_s: float) -> list[tuple[int, Record]]:
+    def _between(self, from_s: float, to_s: float) -> list[tuple[int, LogRecord]]:
         """The records that concern a span, found by bisection, as they are in the order of time."""
 
         def start_s(at: int) -> float:
             span = self._span_before(at)
             return -math.inf if span is None else span[0]
 
-        records: list[tuple[int, Record]] = []
+        records: list[tuple[int, LogRecord]] = []
         for at in range(bisect_right(range(1, len(self.tail)), to_s, key=start_s), 0, -1):
             record = self.tail.record(at)
             span = _span(record.fields)
@@ -230,7 +230,7 @@ class SessionView(View):
     def _tick_of(self, at: int) -> dict[str, Any] | None:
         return self.tail.record(at).fields.get("tick") or None if 0 <= at < len(self.tail) else None
 
-    def _tick(self, at: int, record: Record) -> dict[str, Any]:
+    def _tick(self, at: int, record: LogRecord) -> dict[str, Any]:
         tick, totals = record.fields["tick"], self._sums.totals
         return {
             **{name: number(tick.get(name)) for name in _NUMBERS},

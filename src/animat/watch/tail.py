@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from animat.closed_loop.log import HEAD, MAGIC, RECORD, Record, end_of_intact, parse_fields, parse_record
+from animat.closed_loop.log import HEAD, MAGIC, RECORD, LogRecord, end_of_intact, parse_fields, parse_record
 from animat.closed_loop.outline import Episode, Outline
 from animat.errors import InvalidFile
 from animat.evaluation.statistics import interval_of_mean
@@ -90,7 +90,7 @@ class Tail:
             self.damage = f"{left:,} bytes after the last whole record are {what}"
         return True
 
-    def _record(self, at: int) -> Record:
+    def _record(self, at: int) -> LogRecord:
         return parse_record(self.path, self._data(at))
 
     def peek(self, at: int) -> dict[str, Any]:
