@@ -164,7 +164,7 @@ def _without_influence(policies: Networks) -> list[Control]:
 
 
 @dataclass(frozen=True, eq=False)
-class Row:
+class EvaluationRow:
     """A row of the table: `policies` or a control, with its returns.
 
     Attributes:

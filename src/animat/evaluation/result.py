@@ -9,7 +9,7 @@ from typing import Any
 from animat.columns import align_columns
 from animat.errors import counted, in_min
 from animat.evaluation import transfer
-from animat.evaluation.controls import Row
+from animat.evaluation.controls import EvaluationRow
 from animat.evaluation.coupling import ContextGap
 from animat.evaluation.interventions import InterventionTable
 from animat.evaluation.optimum import Optimum
@@ -47,7 +47,7 @@ class Evaluation:
     mapping: str | None
     recorded_at_min: float | None
     names: tuple[str, ...]
-    rows: tuple[Row, ...]
+    rows: tuple[EvaluationRow, ...]
     findings: tuple[Finding, ...]
     optimum: Optimum | None = None
     no_optimum: str | None = None
@@ -77,7 +77,7 @@ class Evaluation:
         """Names of the findings because of which these returns cannot be expected of a closed loop on the culture."""
         return tuple(dict.fromkeys(f.name for f in self.findings if f.name in transfer.NAMES))
 
-    def score(self, row: Row) -> float | None:
+    def score(self, row: EvaluationRow) -> float | None:
         """The normalised score of a row's mean return, (mean - random) / (optimum - random).
 
         None if random actions were not run, if no optimum is known or it is not above them, or if the optimum leaves

@@ -15,7 +15,7 @@ from animat.environment import Animat, Environment, Neurons, WithoutNeurons
 from animat.errors import InvalidArgument, Mismatch, UnusableData
 from animat.evaluation import transfer
 from animat.evaluation.controllers import Controller
-from animat.evaluation.controls import Control, Row, controls_of, coupling_of
+from animat.evaluation.controls import Control, EvaluationRow, controls_of, coupling_of
 from animat.evaluation.coupling import ContextGap, context_gap, least_context_gap
 from animat.evaluation.interventions import run_interventions
 from animat.evaluation.optimal_returns import WellSampled
@@ -102,7 +102,7 @@ def evaluate(
     findings = world.findings
     if controls is None and (message := lacking(body).get("heuristic")):
         findings += (Finding("no-heuristic", "note", message),)
-    rows: list[Row] = []
+    rows: list[EvaluationRow] = []
     for control in acting:
         rows.append(world.row_of(control, episodes=episodes, seed=seed))
         progress.update(len(rows), steps, control.name)
@@ -190,11 +190,13 @@ class _World:
         of_trials = electrode_pulses(first.conditions, n_pulses)
         return cls(first, environment, simulator, timeline, minute, fixed_from_min, findings, of_trials)
 
-    def row_of(self, control: Control, *, episodes: int, seed: int) -> Row:
+    def row_of(self, control: Control, *, episodes: int, seed: int) -> EvaluationRow:
         ran = control.run(self.environment, self.simulator, episodes=episodes, seed=seed)
         of_trials = self.pulses_of_trials
         pulses = None if of_trials is None else ran.presented @ of_trials * (control.delivery != "silent") / episodes
-        return Row(control.name, control.meaning, ran, control.delivery != "chosen", pulses, self.first.pulse_cost)
+        return EvaluationRow(
+            control.name, control.meaning, ran, control.delivery != "chosen", pulses, self.first.pulse_cost
+        )
 
     def optimum(self, resolution: float, seed: int, progress: Progress) -> Optimum:
         """The optimal return; if responses are known, with its interval and without conditions with few responses."""
@@ -209,7 +211,7 @@ class _World:
         return case.with_interval(best, resolution=resolution, seed=seed, progress=resampled)
 
 
-def _context(rows: Sequence[Row], optimum: Optimum | None, largest_return: float) -> ContextGap | None:
+def _context(rows: Sequence[EvaluationRow], optimum: Optimum | None, largest_return: float) -> ContextGap | None:
     """How much the best coupling leaves unused; None if it, or random actions, were not run."""
     by_name = {each.name: each.episodes.returns[0] for each in rows}
     if not {"coupling", "random"} <= set(by_name):
