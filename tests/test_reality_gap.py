@@ -42,7 +42,7 @@ from animat.neurons.simulator import NeuronSimulator, fit_empirical, pooled_perc
 from animat.neurons.synthetic import LABELS, MEANS_HZ
 from animat.neurons.timeline import Kind, fit_timeline
 from animat.reality_gap import Calibration, RealityGap, Row, check_policies, run_policies
-from animat.reality_gap.predicting import EPISODES, ROLL_OUTS, predict, roll_out_seed
+from animat.reality_gap.predicting import EPISODES, ROLL_OUTS, predict_agents, roll_out_seed
 from animat.reality_gap.row import resampled_means
 from animat.reality_gap.running import planned_episodes
 from animat.reality_gap.session_responses import read_responses
@@ -149,7 +149,7 @@ def test_recordings_before_the_policies_first_one_are_not_used(
 def test_a_folder_with_a_session_is_refused_before_anything_is_predicted(
     tmp_path: Path, series: list[Responses], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("animat.reality_gap.running.predict", lambda *_, **__: pytest.fail("predicted"))
+    monkeypatch.setattr("animat.reality_gap.running.predict_agents", lambda *_, **__: pytest.fail("predicted"))
     (tmp_path / "session.log").touch()
     with pytest.raises(InvalidArgument, match=r"session\.log: expected no session, got one"):
         run(tmp_path, series)
@@ -167,8 +167,8 @@ def test_policies_are_greedy_or_draw_in_prediction_and_loop_alike(
     policy = replace(policy, weights=tuple(even[0]), biases=tuple(even[1]))
     predicted: list[Any] = []
     monkeypatch.setattr(
-        "animat.reality_gap.running.predict",
-        lambda *given, **named: predicted.append(predict(*given, **named)) or predicted[0],
+        "animat.reality_gap.running.predict_agents",
+        lambda *given, **named: predicted.append(predict_agents(*given, **named)) or predicted[0],
     )
     with FakeCulture() as culture:
         calibration = Calibration.of_series(series)
@@ -550,10 +550,10 @@ def test_of_an_interrupted_live_training_the_policy_that_met_the_newest_recordin
 def test_what_the_loop_refuses_is_refused_before_anything_is_predicted(
     series: list[Responses], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def predict(*_: object, **__: object) -> None:
+    def predict_agents(*_: object, **__: object) -> None:
         raise AssertionError("predicted")
 
-    monkeypatch.setattr("animat.reality_gap.running.predict", predict)
+    monkeypatch.setattr("animat.reality_gap.running.predict_agents", predict_agents)
     elsewhere = replace(series[0].conditions[0], electrodes=((99_999,),))
     calibration = Calibration.of_series(series)
     calibration = replace(calibration, conditions=(elsewhere, *calibration.conditions[1:]))

@@ -13,7 +13,7 @@ from scipy.stats import binom, norm
 
 from animat.neurons.history import NO_MEMORY, ranks_among
 from animat.neurons.history_tracker import AdjustedRanks, HistoryTracker
-from animat.reality_gap.predicting import Prediction
+from animat.reality_gap.predicting import AgentPrediction
 from animat.reality_gap.reasons import CHECKS, LEVEL, Evidence, reasons
 from animat.reality_gap.session_responses import CommandSums, SessionResponses
 from animat.recordings.findings import Finding
@@ -48,7 +48,7 @@ def session(
     drawn = rng.integers(0, RECORDED, (100, 2, RECORDED))
     anew = summed(np.take_along_axis(np.broadcast_to(recorded, drawn.shape), drawn, axis=-1))
     everywhere = np.full(2, RECORDED)
-    predicted = Prediction(
+    predicted = AgentPrediction(
         np.zeros(1),
         np.zeros(1),
         CommandSums(everywhere, summed(recorded)[..., None]),

@@ -39,7 +39,7 @@ BOOTSTRAPS_ON_HOST = 40
 """Bootstraps for a robot that is stepped outside JAX: fewer, as an episode takes a thousand times as long."""
 
 
-class Prediction(NamedTuple):
+class AgentPrediction(NamedTuple):
     """The predictions for one agent.
 
     Attributes:
@@ -65,15 +65,15 @@ class Prediction(NamedTuple):
         """How often each condition is presented in an episode, on average."""
         return np.asarray(self.commanded.presented / self.returns.size)
 
-    def of_start(self, number: int) -> Prediction:
+    def of_start(self, number: int) -> AgentPrediction:
         """The same for one of the starts; its commands are still those from all starts."""
         one = slice(number, number + 1)
         return self._replace(returns=self.returns[one], bootstrap_means=self.bootstrap_means[:, one])
 
 
-def pool(predicted: Sequence[Prediction]) -> Prediction:
+def pool(predicted: Sequence[AgentPrediction]) -> AgentPrediction:
     """The predictions of several policies as one."""
-    return Prediction(
+    return AgentPrediction(
         np.concatenate([each.returns for each in predicted], axis=1),
         np.mean([each.bootstrap_means for each in predicted], axis=0),
         _added([each.commanded for each in predicted]),
@@ -85,7 +85,7 @@ def _added(commanded: Sequence[CommandSums]) -> CommandSums:
     return CommandSums(*map(np.array, zip(*commanded, strict=True))).summed(0)
 
 
-def predict(
+def predict_agents(
     policies: Control,
     names: Sequence[str],
     controls: Sequence[Control],
@@ -95,7 +95,7 @@ def predict(
     seed: int = 1,
     starts: Starts | None = None,
     progress: Progress | None = None,
-) -> dict[str, Prediction]:
+) -> dict[str, AgentPrediction]:
     """The prediction for each policy and control, by its name: on a recording's simulator and its bootstrap simulators.
 
     The policies are side by side, with their `names`. `starts` are those of the session, equally often each; None if
@@ -115,7 +115,7 @@ def predict(
         episodes = episodes_each(environment.robot, starts, is_slow=is_slow(number))
         return acting[number].run(environment, simulators[on], episodes=episodes, seed=drawn, starts=starts)
 
-    predictions: dict[str, Prediction] = {}
+    predictions: dict[str, AgentPrediction] = {}
     # A hanging body on the host is only noticed in the main thread (`animat.robots.host.time_limit`).
     with nullcontext() if on_host else ThreadPoolExecutor(len(own_cores())) as executor:
         side_by_side = map if executor is None else executor.map
@@ -141,7 +141,7 @@ def predict(
                 # The first `ROLL_OUTS` are on the recording's simulator, each later one on a bootstrap of it.
                 from_starts = returns[:, of].reshape(len(ran), -1, rounds)
                 commanded = CommandSums(presented[:, of], total[:, of]).summed(1)
-                predictions[name] = Prediction(
+                predictions[name] = AgentPrediction(
                     from_starts[:ROLL_OUTS].reshape(-1, rounds).T,
                     from_starts[ROLL_OUTS:].mean(axis=1),
                     CommandSums(*(sums[:ROLL_OUTS] for sums in commanded)).summed(0),

@@ -12,7 +12,7 @@ from jaxtyping import Float64, Int64
 from scipy.special import stdtr, stdtrit
 
 from animat.reality_gap.calibration import Calibration
-from animat.reality_gap.predicting import Prediction
+from animat.reality_gap.predicting import AgentPrediction
 from animat.reality_gap.session_responses import SessionResponses
 from animat.recordings.findings import Finding
 from animat.responses.quality.history import memory_findings, repetitions
@@ -42,7 +42,7 @@ class Evidence:
 
     session: SessionResponses
     calibration: Calibration
-    predicted: Prediction
+    predicted: AgentPrediction
     gap: Literal[-1, 1]
 
 

@@ -23,8 +23,8 @@ class Row:
     """A row of the table.
 
     Attributes:
-        predicted, bootstrap_means: as in a `Prediction`, together from all starts; where starts differ, from those of
-            the measured episodes, one after the other.
+        predicted, bootstrap_means: as in an `AgentPrediction`, together from all starts; where starts differ, from
+            those of the measured episodes, one after the other.
         measured: returns of complete episodes on the culture.
         pulses_per_action: given to the culture, without the warm-up; the same holds for the measurements below.
         electrode_pulses: mean number per complete episode, one for each electrode of each pulse; NaN without episodes.

@@ -33,7 +33,7 @@ from animat.evaluation.rollouts import Actor
 from animat.progress import Progress, in_phase
 from animat.reality_gap.calibration import Calibration
 from animat.reality_gap.outlook import Outlook, outlook
-from animat.reality_gap.predicting import EPISODES, MOST_ON_HOST, few_predicted, pool, predict
+from animat.reality_gap.predicting import EPISODES, MOST_ON_HOST, few_predicted, pool, predict_agents
 from animat.reality_gap.reasons import Evidence, reasons
 from animat.reality_gap.session_responses import read_responses
 from animat.reality_gap.session_rows import session_rows
@@ -144,7 +144,7 @@ def run_policies(
 
     # On another core: a session must not wait for the optimal return.
     with _meanwhile(lambda: _optimal_return(simulation.animat, calibration, starts)) as computed:
-        predicted = predict(
+        predicted = predict_agents(
             simulation.trained,
             tuple(policies),
             (*controls, *own),

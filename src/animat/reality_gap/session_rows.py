@@ -14,7 +14,7 @@ from animat.closed_loop.session import Session
 from animat.coding.encoder import electrode_pulses
 from animat.evaluation.statistics import compare_episodes
 from animat.goals.tally import Outcome
-from animat.reality_gap.predicting import Prediction, pool
+from animat.reality_gap.predicting import AgentPrediction, pool
 from animat.reality_gap.row import Row
 from animat.reality_gap.session_responses import outcomes
 from animat.robots.starts import Starts
@@ -24,7 +24,7 @@ def session_rows(
     session: Session,
     agents: Sequence[Agent],
     names: tuple[str, ...],
-    predicted: Mapping[str, Prediction],
+    predicted: Mapping[str, AgentPrediction],
     loop: Loop,
     pulse_cost: float,
     starts: Starts | None,
