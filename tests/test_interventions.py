@@ -16,7 +16,7 @@ from animat.errors import InvalidArgument
 from animat.evaluation.commands import mean_commands
 from animat.evaluation.controls import interventions_of
 from animat.evaluation.interventions import run_interventions
-from animat.evaluation.rollouts import Actor, Networks, roll_out, trace
+from animat.evaluation.rollouts import Actor, Networks, roll_out, trajectories
 from animat.neurons.simulator import indifferent
 from animat.neurons.synthetic import synthetic_simulator
 from animat.robots import Cartpole, Quantity, Robot, Wheels
@@ -140,7 +140,7 @@ def test_random_spikes_have_the_rates_of_the_culture_and_do_not_depend_on_stimul
 
 def test_yoked_stimuli_are_those_of_the_episode_that_is_observed() -> None:
     yoked = YokedDelivery(Animat(Aiming(), Linear(), 5))
-    traced = trace(yoked, SIMULATOR, BEST, episodes=50, seed=2)
+    traced = trajectories(yoked, SIMULATOR, BEST, episodes=50, seed=2)
     other = traced.states.info["other_episode"].robot
     agree = np.asarray(other.goal * other.sensed)[:, :, :-1] > 0
     np.testing.assert_array_equal(traced.actions == 4, agree)
@@ -158,7 +158,7 @@ def test_the_goal_is_switched_once_and_nothing_else() -> None:
     assert switched[:3] == body[:3] and switched[3:] == other[3:]
     assert plain.robot == GoalSwitch(plain, 3).robot
     environment = GoalSwitch(ENVIRONMENT, 3)
-    once, usual = (trace(each, SIMULATOR, BEST, episodes=40, seed=3) for each in (environment, ENVIRONMENT))
+    once, usual = (trajectories(each, SIMULATOR, BEST, episodes=40, seed=3) for each in (environment, ENVIRONMENT))
     goals, sensed = (np.asarray(each) for each in (once.states.robot.goal, once.states.robot.sensed))
     np.testing.assert_array_equal(sensed, usual.states.robot.sensed)
     np.testing.assert_array_equal(goals[..., :3], np.asarray(usual.states.robot.goal)[..., :3])

@@ -18,7 +18,7 @@ from animat.environment import Environment, Neurons
 from animat.errors import InvalidArgument
 from animat.evaluation.commands import mean_commands
 from animat.evaluation.optimum import Optimum
-from animat.evaluation.rollouts import Actor, Seen, Uniforms, heuristic_policy, nearest_action, roll_out, trace
+from animat.evaluation.rollouts import Actor, Seen, Uniforms, heuristic_policy, nearest_action, roll_out, trajectories
 from animat.evaluation.statistics import CONFIDENCE, Interval, standard_error
 from animat.progress import Progress
 from animat.robots.base import capability
@@ -144,7 +144,7 @@ def _near_heuristic(
     robot = environment.robot
     if not hasattr(robot, "heuristic"):
         return np.zeros((0, 0))
-    ran = trace(environment, simulator, heuristic_policy(environment, simulator), episodes=EPISODES, seed=seed)
+    ran = trajectories(environment, simulator, heuristic_policy(environment, simulator), episodes=EPISODES, seed=seed)
     running = np.arange(robot.episode_limit) < ran.lengths[..., None]
     observed = ran.observations[..., :-1, : len(robot.observation_spec)][running]
     wanted = np.asarray(jax.vmap(capability(robot, "heuristic"))(observed), np.float64).reshape(len(observed), -1)

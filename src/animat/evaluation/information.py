@@ -13,7 +13,7 @@ from jaxtyping import Array, Float64, Int
 
 from animat.environment import Environment, Neurons
 from animat.errors import InvalidArgument
-from animat.evaluation.rollouts import Actor, trace
+from animat.evaluation.rollouts import Actor, trajectories
 from animat.evaluation.statistics import Interval, interval_of_mean
 from animat.robots.base import capability
 
@@ -60,10 +60,10 @@ def goal_information(
     if environment.n_actions is None:
         raise InvalidArgument("environment: expected discrete actions for goal information, got continuous ones")
     rng = np.random.default_rng([seed, 41])
-    traced = trace(environment, simulator, actors, episodes=EPISODES, seed=seed)
-    when = (rng.random(traced.lengths.shape) * traced.lengths).astype(np.int64)
+    ran = trajectories(environment, simulator, actors, episodes=EPISODES, seed=seed)
+    when = (rng.random(ran.lengths.shape) * ran.lengths).astype(np.int64)
     rows, columns = np.indices(when.shape)
-    states = jax.tree.map(lambda x: x[rows, columns, when], traced.states)
+    states = jax.tree.map(lambda x: x[rows, columns, when], ran.states)
     key = jax.random.key(int(rng.integers(2**31)))
     actions = np.asarray(_at_each_goal(environment, draws, states, actors, jax.random.split(key, actors.n_actors)))
     bits = conditional_information(actions.reshape(-1, *actions.shape[2:]), environment.n_actions)

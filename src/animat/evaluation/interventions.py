@@ -13,7 +13,7 @@ from animat.environment import Animat, Environment, Neurons
 from animat.errors import InvalidArgument
 from animat.evaluation.controls import Control, interventions_of
 from animat.evaluation.information import DRAWS, GoalInformation, goal_information
-from animat.evaluation.rollouts import Networks, Traces, trace
+from animat.evaluation.rollouts import Networks, Trajectories, trajectories
 from animat.evaluation.statistics import Interval, interval_of_mean
 from animat.progress import Progress, Silent
 from animat.records import as_json
@@ -23,8 +23,8 @@ from animat.wrappers import unwrapped
 AS_THEY_ARE = "as they are"
 WITH_INFORMATION = (AS_THEY_ARE, "silent", "shuffled")
 """Where goal information is computed: a policy that knows the goal but cannot act on it has bits but no return."""
-TRACED_EPISODES = 32
-"""Episodes of each policy that are traced to find the first changed choice after a switch of the goal."""
+SWITCH_EPISODES = 32
+"""Episodes of each policy in which the first changed choice after a switch of the goal is sought."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,14 +143,14 @@ def run_interventions(
     if switch_at is not None:
         # The same episodes, with the same random numbers, with and without a switch.
         usual_trace, switched = (
-            trace(*each.within(environment, simulator), policies, episodes=TRACED_EPISODES, seed=seed)
+            trajectories(*each.within(environment, simulator), policies, episodes=SWITCH_EPISODES, seed=seed)
             for each in (plain, acting[-1])
         )
         turning = _switch_effect(usual_trace, switched, switch_at)
     return InterventionTable(tuple(rows), turning)
 
 
-def _switch_effect(usual: Traces, other: Traces, at: int) -> SwitchEffect:
+def _switch_effect(usual: Trajectories, other: Trajectories, at: int) -> SwitchEffect:
     lasted = usual.lengths > at
     # Entries after the end of either episode are not choices.
     last = np.minimum(usual.lengths, other.lengths)[..., None]

@@ -15,7 +15,7 @@ from animat.environment import Environment, Neurons
 from animat.errors import InvalidArgument, first_line, shown, some_of, within
 from animat.evaluation.controllers import Called, CalledEpisodes, Controller, acts, expect_condition, sees_neurons
 from animat.evaluation.controls import OWN, Control
-from animat.evaluation.rollouts import Actor, Seen, Uniforms, trace
+from animat.evaluation.rollouts import Actor, Seen, Uniforms, trajectories
 from animat.registry import imported
 from animat.responses.condition import Condition
 from animat.robots.host import HostRobot
@@ -91,7 +91,7 @@ def _expect_actions(actor: Actor, environment: Environment[Any], simulator: Neur
             # Whether an index is in range is checked later, in each step of its episodes.
             _expect_integers(actor, environment)
             return
-        found = np.unique(trace(environment, simulator, actor, episodes=8, seed=1).actions).tolist()
+        found = np.unique(trajectories(environment, simulator, actor, episodes=8, seed=1).actions).tolist()
     except Exception as error:
         raise InvalidArgument(f"expected it to act in JAX, got {first_line(error)}") from error
     for action in found:

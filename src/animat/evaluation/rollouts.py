@@ -335,7 +335,7 @@ def _look_in_jit(environment: Environment[Any], course: _Course, key: PRNGKeyArr
     return observation * environment.scales, uniforms, noise
 
 
-class Traces(NamedTuple):
+class Trajectories(NamedTuple):
     """Episodes of several actors; entries after the end of an episode are meaningless.
 
     Attributes:
@@ -349,19 +349,21 @@ class Traces(NamedTuple):
     lengths: Int[np.ndarray, "actors episodes"]
 
 
-def trace(environment: Environment[Any], simulator: Neurons, actors: Actor, *, episodes: int, seed: int) -> Traces:
+def trajectories(
+    environment: Environment[Any], simulator: Neurons, actors: Actor, *, episodes: int, seed: int
+) -> Trajectories:
     """Run episodes of each actor on a robot in JAX; arguments as in `roll_out`."""
     n_actors = actors.n_actors
     keys = jax.random.split(jax.random.key(seed), n_actors * episodes).reshape(n_actors, episodes)
-    traced: Traces = jax.device_get(_trace(environment, simulator, actors, keys))
-    return traced
+    ran: Trajectories = jax.device_get(_trajectories(environment, simulator, actors, keys))
+    return ran
 
 
 @partial(jax.jit, static_argnums=0)
-def _trace(environment: Environment[Any], simulator: Neurons, actors: Actor, keys: Any) -> Traces:
+def _trajectories(environment: Environment[Any], simulator: Neurons, actors: Actor, keys: Any) -> Trajectories:
     n_drawn = environment.n_drawn
 
-    def one_episode(actor: Actor, key: Any) -> Traces:
+    def one_episode(actor: Actor, key: Any) -> Trajectories:
         def iteration(carry: Any, key: Any) -> Any:
             state, going = carry
             uniforms = jax.random.uniform(key, (n_drawn + environment.noise_size,), jnp.float32)
@@ -377,6 +379,6 @@ def _trace(environment: Environment[Any], simulator: Neurons, actors: Actor, key
         _, (after, actions, commands, going) = jax.lax.scan(iteration, (first, jnp.bool_(True)), keys)
         states = jax.tree.map(lambda one, more: jnp.concatenate([one[None], more]), first, after)
         observations: Any = jax.vmap(environment.observe)(states)
-        return Traces(states, observations, actions, commands, going.sum())
+        return Trajectories(states, observations, actions, commands, going.sum())
 
     return jax.vmap(lambda actor, of_actor: jax.vmap(partial(one_episode, actor))(of_actor))(actors, keys)

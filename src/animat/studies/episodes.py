@@ -15,7 +15,7 @@ from pandas import DataFrame as DataFrame
 
 from animat.environment import Environment
 from animat.evaluation.host_rollouts import paths_on_host
-from animat.evaluation.rollouts import Actor, Episodes, trace
+from animat.evaluation.rollouts import Actor, Episodes, trajectories
 from animat.goals.robot import RobotWithGoal
 from animat.neurons.simulator import NeuronSimulator
 from animat.report.results import ObjectiveMet
@@ -122,6 +122,6 @@ def record_paths(environment: Environment[Any], simulator: NeuronSimulator | Non
     if isinstance(environment.robot, HostRobot):
         keys = jax.random.split(jax.random.key(seed), actors.n_actors)
         return Paths(*paths_on_host(environment, simulator, actors, keys, seed))
-    traced = trace(environment, simulator, actors, episodes=1, seed=seed)
-    observations, commands, lengths = (each[:, 0] for each in (traced.observations, traced.commands, traced.lengths))
+    ran = trajectories(environment, simulator, actors, episodes=1, seed=seed)
+    observations, commands, lengths = (each[:, 0] for each in (ran.observations, ran.commands, ran.lengths))
     return Paths(observations, commands, lengths.astype(np.int64))
