@@ -10,7 +10,7 @@ from animat.cli import main
 from animat.closed_loop.session import LOG_FILE as SESSION
 from animat.cultures.series import SELECTION_FILE, STATE_FILE
 from animat.errors import Mismatch
-from animat.folders import MARKERS, Kind, expect_no_other
+from animat.folders import MARKERS, FolderKind, expect_no_other
 from animat.live.plan import LOG_FILE as LIVE
 from animat.recordings.formats.nwb import recording_name, write_nwb
 from animat.studies.cultures import MANIFEST as CULTURES
@@ -22,14 +22,14 @@ from test_run_on_recordings import policy_of
 
 TINY = Path(__file__).parent / "tiny_study.toml"
 
-COMMANDS: dict[Kind, tuple[str, list[str]]] = {
+COMMANDS: dict[FolderKind, tuple[str, list[str]]] = {
     "recording": ("recordings", ["record", "--sessions", "1"]),
     "training": ("policies", ["train", "cartpole", "--mapping", "none", "--policies", "1", "--iterations", "1000"]),
     "session": ("a session", ["run", "{beside}/p0.safetensors", "--recordings", "{beside}/synthetic.nwb"]),
     "cultures": ("a study of many cultures", ["study", "{beside}/many.toml"]),
 }
 """What each takes its folder for, and its words but for the folder."""
-OTHERS: list[tuple[Kind, str, str]] = [
+OTHERS: list[tuple[FolderKind, str, str]] = [
     ("session", SESSION, "a session"),
     ("training", TRAINING, "policies"),
     ("training", "p0.safetensors", "policies"),
@@ -48,7 +48,12 @@ OTHERS: list[tuple[Kind, str, str]] = [
     ("kind", "mark", "description"), [(kind, *other) for kind in COMMANDS for of, *other in OTHERS if of != kind]
 )
 def test_a_folder_of_another_kind_is_refused_and_stays_as_it_is(
-    kind: Kind, mark: str, description: str, few_bootstraps: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    kind: FolderKind,
+    mark: str,
+    description: str,
+    few_bootstraps: None,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     if kind == "session":
         write_nwb(synthetic_recording(1, patterns=40, channels=32), tmp_path / "synthetic.nwb")
@@ -65,7 +70,7 @@ def test_a_folder_of_another_kind_is_refused_and_stays_as_it_is(
 
 
 @pytest.mark.parametrize("kind", COMMANDS)
-def test_a_folder_of_the_same_kind_an_empty_one_and_other_files_are_accepted(kind: Kind, tmp_path: Path) -> None:
+def test_a_folder_of_the_same_kind_an_empty_one_and_other_files_are_accepted(kind: FolderKind, tmp_path: Path) -> None:
     expect_no_other(tmp_path / "none", kind)
     for beside in (".p0.safetensors", ".session.log", "notes.txt", SELECTION_FILE, "raster.png", "best.toml"):
         (tmp_path / beside).touch()

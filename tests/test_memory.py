@@ -30,7 +30,7 @@ from animat.neurons.fidelity import fidelity
 from animat.neurons.history_tracker import HistoryState, HistoryTracker
 from animat.neurons.memory import NO_MEMORY, Memory, MemorySimulator, _slopes, fit_memory
 from animat.neurons.simulator import EmpiricalSimulator, fit_empirical
-from animat.neurons.timeline import Kind, fit_timeline, load_timeline, save_timeline
+from animat.neurons.timeline import SimulatorKind, fit_timeline, load_timeline, save_timeline
 from animat.reality_gap import Calibration
 from animat.recordings.findings import Finding
 from animat.recordings.formats.nwb import write_nwb
@@ -479,8 +479,8 @@ def test_simulators_of_recordings_of_different_lengths_stack() -> None:
         fit_memory(series[1], room=20)
 
 
-@pytest.mark.parametrize("kind", get_args(Kind))
-def test_a_study_keeps_simulators_of_every_kind(kind: Kind, tmp_path: Path) -> None:
+@pytest.mark.parametrize("kind", get_args(SimulatorKind))
+def test_a_study_keeps_simulators_of_every_kind(kind: SimulatorKind, tmp_path: Path) -> None:
     culture, presentation = RecordedCulture("virtual", 3), Presentation("mixed", 2)
     known: dict[str, Any] = {
         "culture": culture,
@@ -525,8 +525,8 @@ def test_a_file_of_another_kind_is_no_simulators(content: bytes | None, reason: 
     assert reason in str(error.value) and str(error.value).endswith("; run the command again to replace it")
 
 
-@pytest.mark.parametrize("kind", get_args(Kind))
-def test_a_report_says_how_its_simulators_differ_from_the_papers(kind: Kind) -> None:
+@pytest.mark.parametrize("kind", get_args(SimulatorKind))
+def test_a_report_says_how_its_simulators_differ_from_the_papers(kind: SimulatorKind) -> None:
     said = dict(decisions(replace(paper_study(), simulators=Simulators(kind=kind))))
     words = {
         "histogram": "20 bins are percentiles",

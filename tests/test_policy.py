@@ -26,7 +26,7 @@ from animat.cli.command import simulator_settings
 from animat.closed_loop.loop import Loop
 from animat.coding.mapping import mapping_named
 from animat.errors import InvalidArgument, InvalidFile, UnusableData
-from animat.neurons.timeline import Kind
+from animat.neurons.timeline import SimulatorKind
 from animat.responses.condition import Condition
 from animat.responses.conditions import conditions_named
 from animat.robots.cartpole import Cartpole
@@ -568,7 +568,7 @@ def test_only_policies_with_neurons_see_their_history_state_which_numpy_may_say(
 
 def test_what_is_read_of_a_provenance_is_what_training_writes() -> None:
     hints = get_type_hints(TrainingProvenance) | get_type_hints(SimulatorProvenance)
-    for name, choices in (("kind", Kind), ("percentiles", Percentiles), ("delivery", Delivery)):
+    for name, choices in (("kind", SimulatorKind), ("percentiles", Percentiles), ("delivery", Delivery)):
         assert get_args(hints[name]) == get_args(choices)
 
 

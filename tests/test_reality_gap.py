@@ -40,7 +40,7 @@ from animat.evaluation.table import evaluate
 from animat.neurons.history_tracker import HistoryState
 from animat.neurons.simulator import NeuronSimulator, fit_empirical, pooled_percentiles, silenced
 from animat.neurons.synthetic import LABELS, MEANS_HZ
-from animat.neurons.timeline import Kind, fit_timeline
+from animat.neurons.timeline import SimulatorKind, fit_timeline
 from animat.reality_gap import Calibration, RealityGap, Row, check_policies, run_policies
 from animat.reality_gap.predicting import EPISODES, ROLL_OUTS, predict_agents, roll_out_seed
 from animat.reality_gap.row import resampled_means
@@ -579,7 +579,9 @@ def drawn_responses(rng: np.random.Generator, n: int) -> Responses:
 
 
 @pytest.mark.parametrize("kind", ["histogram", "empirical", "memory"])
-def test_simulators_of_bootstrapped_responses_have_the_recordings_shape(kind: Kind, few_bootstraps: None) -> None:
+def test_simulators_of_bootstrapped_responses_have_the_recordings_shape(
+    kind: SimulatorKind, few_bootstraps: None
+) -> None:
     rng = np.random.default_rng(1)
     series = [drawn_responses(rng, 40), replace(drawn_responses(rng, 90), start_min=10.0)]
     calibration = Calibration.of_series(series, at_min=0.0, kind=kind)

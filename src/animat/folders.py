@@ -11,9 +11,9 @@ from typing import Any, Literal
 from animat.errors import InvalidFile, Mismatch
 from animat.plain_file import is_folder
 
-Kind = Literal["session", "training", "tuning", "study", "cultures", "recording", "live"]
+FolderKind = Literal["session", "training", "tuning", "study", "cultures", "recording", "live"]
 
-MARKERS: dict[Kind, tuple[str, ...]] = {
+MARKERS: dict[FolderKind, tuple[str, ...]] = {
     "session": ("session.log",),
     "training": ("training.json", "[!.]*.safetensors"),
     "tuning": ("tune.json",),
@@ -23,7 +23,7 @@ MARKERS: dict[Kind, tuple[str, ...]] = {
     "live": ("live.log",),
 }
 """Names or patterns, any one of which is enough. The modules that write these files import JAX; this one does not."""
-_DESCRIPTIONS: dict[Kind, str] = {
+_DESCRIPTIONS: dict[FolderKind, str] = {
     "session": "a session",
     "training": "policies",
     "tuning": "a tuning",
@@ -38,7 +38,7 @@ _NOTHING = object()
 """The value of a missing key."""
 
 
-def expect_no_other(folder: Path, kind: Kind) -> None:
+def expect_no_other(folder: Path, kind: FolderKind) -> None:
     """Raise Mismatch if a folder holds work of other kinds and none of this kind; a missing folder holds nothing."""
     if not is_folder(folder):
         return

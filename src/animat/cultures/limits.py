@@ -13,7 +13,7 @@ from pydantic import Field
 
 from animat.errors import InvalidArgument, UnsafeStimulus
 from animat.records import Flag, FromZero, Positive, Whole, record
-from animat.stimulation.pulse import Kind, Pulse
+from animat.stimulation.pulse import Pulse, PulseKind
 
 Count = Annotated[Whole, Field(ge=0)]
 
@@ -46,7 +46,7 @@ class Limits:
         InvalidArgument: for a limit that is not a number, not finite or below 0, or a count that is not whole.
     """
 
-    kind: Kind
+    kind: PulseKind
     amplitude: FromZero
     phase_us: tuple[Positive, Positive]
     charge_per_phase: FromZero

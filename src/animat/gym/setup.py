@@ -22,7 +22,7 @@ from animat.goals.goal import Goal
 from animat.goals.robot import with_goal
 from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.synthetic import LABELS, synthetic_simulator
-from animat.neurons.timeline import Kind, fit_timeline
+from animat.neurons.timeline import SimulatorKind, fit_timeline
 from animat.recordings.findings import warnings_once
 from animat.recordings.reading import read_sources
 from animat.registry import is_ours
@@ -70,7 +70,7 @@ def set_up(
     at_min: float | None = None,
     conditions: str | None = None,
     window_ms: tuple[float, float] = DEFAULT_WINDOW_MS,
-    kind: Kind | None = None,
+    kind: SimulatorKind | None = None,
     readouts: str | Readouts | None = None,
     delivery: Delivery = "chosen",
     neural_observation: bool = False,

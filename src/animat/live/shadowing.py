@@ -24,7 +24,7 @@ from animat.cultures.virtual import VirtualCulture
 from animat.errors import AnimatError, BudgetSpent, InvalidFile, Mismatch, UnusableData, as_invalid_file, counted
 from animat.live.plan import LOG_FILE, POLICIES, RECORDINGS, SESSION, Timetable, check_plan, for_the_first_recording
 from animat.live.trainers import Trainers
-from animat.neurons.timeline import Kind, SimulatorTimeline, fit_timeline
+from animat.neurons.timeline import SimulatorKind, SimulatorTimeline, fit_timeline
 from animat.progress import Part, Progress, in_phase
 from animat.reality_gap import Calibration, RealityGap, run_policies
 from animat.recordings.formats.nwb import recording_name, write_nwb
@@ -75,7 +75,7 @@ def live(
     episodes: int = 5,
     with_controls: bool = False,
     adaptive: bool = True,
-    kind: Kind | None = None,
+    kind: SimulatorKind | None = None,
     account: Account | None = None,
     progress: Progress | None = None,
     report: Callable[[str], None] | None = None,
@@ -167,7 +167,7 @@ class _Run:
     protocol: Protocol
     folder: Path
     timetable: Timetable
-    kind: Kind | None
+    kind: SimulatorKind | None
     account: Account
     files: list[Path] = field(default_factory=list)
     used: list[Responses] = field(default_factory=list)

@@ -43,7 +43,7 @@ from animat.stimulation.protocol import Presentation
 from animat.tables import briefly, read_only
 from animat.writing import write_whole
 
-Kind = Literal["histogram", "empirical", "memory"]
+SimulatorKind = Literal["histogram", "empirical", "memory"]
 """Draw from a distribution in bins (the paper); a measured response; or one measured after a similar history."""
 
 _MEMORY_OF_BLOCKS = Finding(
@@ -149,21 +149,21 @@ def room_for(series: Sequence[Responses]) -> int:
     return max(int(np.bincount(each.condition[~each.is_burst], minlength=1).max()) for each in series)
 
 
-def default_kind(responses: Responses) -> Kind:
+def default_kind(responses: Responses) -> SimulatorKind:
     """The kind that suits a recording: one with memory, unless stimuli in blocks hide the memory."""
     return "histogram" if responses.is_blocked else "memory"
 
 
 @checked_arguments
 def fit_timeline(
-    series: Sequence[Responses], *, kind: Kind | None = None, bins: int = 20, range_hz: float | None = None
+    series: Sequence[Responses], *, kind: SimulatorKind | None = None, bins: int = 20, range_hz: float | None = None
 ) -> SimulatorTimeline:
     """Fit a simulator to each recording's responses and stack them in the order of time.
 
     Args:
         series: responses of the recordings, all with the same conditions, window and presentation, in any order.
-        kind: as in `Kind`; None: `"memory"`, but `"histogram"` if stimuli were presented in blocks, which do not show
-            how a culture responds after a different condition.
+        kind: as in `SimulatorKind`; None: `"memory"`, but `"histogram"` if stimuli were presented in blocks, which do
+            not show how a culture responds after a different condition.
         bins, range_hz: of a histogram, the same for all recordings, as in `fit_histogram`.
 
     Raises:
@@ -269,7 +269,7 @@ def fit_simulator(
     room: int | None = None,
     memory: Memory | None = None,
 ) -> NeuronSimulator:
-    """Fit a simulator of a `Kind`; arguments and errors are those of `fit_histogram`, `fit_empirical` and `fit_memory`.
+    """Fit a simulator of a kind; arguments and errors are those of `fit_histogram`, `fit_empirical` and `fit_memory`.
 
     Histograms of several readouts need `room`, too.
     """
@@ -284,4 +284,4 @@ def fit_simulator(
         # Without memory the trace keeps its initial value, as for policies in a loop (`HistoryTracker`).
         still = jnp.full_like(fitted.left, INITIAL_HISTORY[0])
         return replace(fitted, left=still) if fitted.memory == NO_MEMORY else fitted
-    raise InvalidArgument(f"kind: expected one of {', '.join(get_args(Kind))}, got {kind!r}")
+    raise InvalidArgument(f"kind: expected one of {', '.join(get_args(SimulatorKind))}, got {kind!r}")

@@ -14,7 +14,7 @@ from animat.errors import InvalidArgument
 from animat.neurons.history import NO_MEMORY
 from animat.neurons.memory import MemorySimulator
 from animat.neurons.prediction import CLASSES, Halves, free_runs, halved, in_time, predict, recorded_series, share_below
-from animat.neurons.timeline import Kind, default_kind, fit_simulator
+from animat.neurons.timeline import SimulatorKind, default_kind, fit_simulator
 from animat.responses.responses import Responses
 from animat.tables import briefly
 
@@ -217,7 +217,7 @@ def validate(responses: Responses, *, kind: str | None = None, seed: int = 1, re
         raise InvalidArgument(f"readout: expected one of {n} readouts, or None if there is only one, got {readout}")
     rng, halves = np.random.default_rng(seed), halved(responses, readout)
     median_hz = halves.percentiles_hz[5]
-    kinds: tuple[str, ...] = get_args(Kind)
+    kinds: tuple[str, ...] = get_args(SimulatorKind)
     if kind is not None and kind not in kinds:
         raise InvalidArgument(f"kind: expected one of {', '.join(kinds)}, got {kind!r}")
     simulators = {each: fit_simulator(halves.first, kind=each) for each in kinds}

@@ -21,7 +21,7 @@ from animat.neurons.history import Ranked
 from animat.neurons.history_tracker import AdjustedRanks, HistoryState, HistoryTracker
 from animat.neurons.memory import MemorySimulator
 from animat.neurons.simulator import NeuronSimulator
-from animat.neurons.timeline import Kind, fit_simulator, fit_timeline, room_for
+from animat.neurons.timeline import SimulatorKind, fit_simulator, fit_timeline, room_for
 from animat.recordings.findings import Finding
 from animat.recordings.recorded_culture import RecordedCulture
 from animat.recordings.recording import Recording
@@ -116,7 +116,7 @@ class Calibration:
         *,
         at_min: float | None = None,
         adaptive: bool = True,
-        kind: Kind | None = None,
+        kind: SimulatorKind | None = None,
         bins: int = 20,
         range_hz: float | None = None,
     ) -> Self:

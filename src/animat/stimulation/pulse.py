@@ -11,7 +11,7 @@ from pydantic import Field
 from animat.errors import InvalidArgument
 from animat.records import Number, Positive, record
 
-Kind = Literal["voltage", "current"]
+PulseKind = Literal["voltage", "current"]
 
 
 @record
@@ -27,7 +27,7 @@ class Phase:
             raise InvalidArgument("amplitude: expected either amplitude_mv or amplitude_ua, got both or neither")
 
     @property
-    def kind(self) -> Kind:
+    def kind(self) -> PulseKind:
         """Whether voltage or current is held."""
         return "voltage" if self.amplitude_mv is not None else "current"
 
@@ -57,7 +57,7 @@ class Pulse:
             raise InvalidArgument("phases: expected all voltage or all current, got both in one pulse")
 
     @property
-    def kind(self) -> Kind:
+    def kind(self) -> PulseKind:
         """Whether voltage or current is held."""
         return self.phases[0].kind
 

@@ -13,7 +13,7 @@ from typing import Any
 from animat.closed_loop.session import LOG_FILE
 from animat.errors import InvalidArgument
 from animat.execution.task import UNFINISHED
-from animat.folders import MARKERS, Kind
+from animat.folders import MARKERS, FolderKind
 from animat.recordings.formats.npz import UNDER_WAY
 from animat.writing import LOCK
 
@@ -31,7 +31,7 @@ _SILENT_S = 60.0
 class Item:
     """An item to watch: its place in the watched folder ("": the folder itself), and when it last changed."""
 
-    kind: Kind
+    kind: FolderKind
     place: str
     changed_s: float
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 from animat.errors import InvalidArgument, InvalidFile, first_line
-from animat.folders import MARKERS, Kind
+from animat.folders import MARKERS, FolderKind
 from animat.progress import Speed, format_duration
 from animat.watch.files import json_of, number, text
 
@@ -24,7 +24,7 @@ Style = Literal["line", "thin", "dashed", "dots", "steps"]
 class View(abc.ABC):
     """A folder of one `kind` that is viewed repeatedly; `file` identifies it."""
 
-    kind: ClassVar[Kind]
+    kind: ClassVar[FolderKind]
     speed_over_s: ClassVar[float] = 60.0
     """Longest time over which the speed of work is measured."""
 
