@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Int64
 
 from animat.cultures.base import Culture
-from animat.cultures.devices.cl1_delivery import FRAMES_PER_S, LEAD_US, Session, sdk
+from animat.cultures.devices.cl1_delivery import FRAMES_PER_S, LEAD_US, CL1Session, sdk
 from animat.cultures.failures import as_device_failure, describe_error, while_open
 from animat.cultures.holding import of_the_machine, of_the_program
 from animat.cultures.observed import Observed, Spikes
@@ -113,7 +113,7 @@ class CL1Culture(Culture):
         self._channels = Channels(channel.astype(np.str_), channel, (channel // 8) * pitch, (channel % 8) * pitch)
         self._record_to, self._raw = record_to, raw
         self._stack = ExitStack()
-        self._session: Session | None = None
+        self._session: CL1Session | None = None
         self._begun = History()
         self.spikes_not_on_electrodes = 0
         """Spikes that the device reported on ground or reference, which are not recording electrodes; left out."""
@@ -178,7 +178,7 @@ class CL1Culture(Culture):
         self.spikes_not_on_electrodes = self.spikes_reported_late = 0
         with as_device_failure("CL1", "open", ": is another program using it?"):
             neurons = self._stack.enter_context(cl.open(take_control=True, wait_until_recordable=True))
-            session = Session(cl, neurons, self._ticks_per_s, self._margin_frames, self._jitter)
+            session = CL1Session(cl, neurons, self._ticks_per_s, self._margin_frames, self._jitter)
             self._session = session
             if (rate_hz := neurons.get_frames_per_second()) != FRAMES_PER_S:
                 raise DeviceFailed(f"CL1: expected {FRAMES_PER_S} frames a second, got {rate_hz}")
@@ -241,7 +241,7 @@ class CL1Culture(Culture):
             self._stack.close()
 
 
-def _remedy(error: Exception, session: Session) -> str:
+def _remedy(error: Exception, session: CL1Session) -> str:
     """What to do if the SDK's simulator was too slow; empty for other errors, and on a device."""
     if "Timeout waiting for timestamp" not in str(error) or not session.cl.is_simulator():
         return ""

@@ -39,7 +39,7 @@ _ROW_OF = np.full(CHANNELS, UNKNOWN, dtype=np.int64)
 _ROW_OF[list(SITES)] = np.arange(len(SITES))
 
 
-class Session:
+class CL1Session:
     """An open CL1, from opening to closing: delivers stimuli through `Neurons.loop` and stim plans.
 
     A plan runs at a frame, and its pulse comes one lead time later. Pulses are queued within the loop, in order of

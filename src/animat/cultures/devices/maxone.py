@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Int64
 
 from animat.cultures.base import Culture
-from animat.cultures.devices.maxone_commands import FRAMES_PER_S, INITIAL_DELAY, SAMPLE_US, Sequences, Wiring, wire
+from animat.cultures.devices.maxone_commands import FRAMES_PER_S, INITIAL_DELAY, SAMPLE_US, Routing, Sequences, route
 from animat.cultures.devices.maxone_stream import AMPLIFIERS, SpikeStream, ZmqSpikes
 from animat.cultures.failures import as_device_failure, describe_error, once_opened, vendor_module, while_open
 from animat.cultures.holding import of_the_machine
@@ -105,7 +105,7 @@ class MaxOneCulture(Culture):
         self._given_stream, self._sequence_s, self._settle = stream, sequence_s, settle
         self._mx: ModuleType | None = None
         self._stream: SpikeStream | None = None
-        self._wiring: Wiring | None = None
+        self._routing: Routing | None = None
         self._sequences: Sequences | None = None
         self._guard: Guard | None = None
         """On the device's clock."""
@@ -120,12 +120,12 @@ class MaxOneCulture(Culture):
     @property
     def channels(self) -> Channels:
         """The recording electrodes that were routed, labelled by amplifier number."""
-        return once_opened(self._wiring).channels
+        return once_opened(self._routing).channels
 
     @property
     def not_routed(self) -> tuple[int, ...]:
         """Recording electrodes that were selected but not routed."""
-        return once_opened(self._wiring).not_routed
+        return once_opened(self._routing).not_routed
 
     @property
     def stimulation_electrodes(self) -> tuple[int, ...]:
@@ -154,14 +154,14 @@ class MaxOneCulture(Culture):
 
     @property
     def provenance(self) -> dict[str, str]:
-        wiring = once_opened(self._wiring)
-        units = ", ".join(f"{electrode}: {unit}" for electrode, unit in wiring.unit_of.items())
+        routing = once_opened(self._routing)
+        units = ", ".join(f"{electrode}: {unit}" for electrode, unit in routing.unit_of.items())
         return {
             # Must not change, even if a module moves: a series continues only where it is the same.
             "source": "MaxOne by animat.cultures.maxone",
             "dac_lsb_mv": str(self._lsb_mv),
             "stimulation_units": units,
-            "not_routed": " ".join(map(str, wiring.not_routed)),
+            "not_routed": " ".join(map(str, routing.not_routed)),
             "stimulus_times": "estimated: the newest frame when the server had taken the sequence, and its delay",
         }
 
@@ -183,8 +183,8 @@ class MaxOneCulture(Culture):
             self._switch_power(True)
             self._wait("waitInit")
             self._lsb_mv = _step_mv(mx.query_DAC_lsb_mV())
-            self._wiring = wire(mx, self.selection, wait=self._wait)
-            self._sequences = Sequences(mx, self._wiring.unit_of, self._lsb_mv)
+            self._routing = route(mx, self.selection, wait=self._wait)
+            self._sequences = Sequences(mx, self._routing.unit_of, self._lsb_mv)
             self._stream = self._given_stream or ZmqSpikes()
             self._stream.start()
         frame = self._stream.frame()
@@ -239,7 +239,7 @@ class MaxOneCulture(Culture):
         if len(amplifiers) and not 0 <= amplifiers.min() <= amplifiers.max() < AMPLIFIERS:
             strange = amplifiers[(amplifiers < 0) | (amplifiers >= AMPLIFIERS)][0]
             raise DeviceFailed(f"MaxOne: expected spikes on amplifiers 0 to {AMPLIFIERS - 1}, got one on {strange}")
-        row = once_opened(self._wiring).row_of[amplifiers]
+        row = once_opened(self._routing).row_of[amplifiers]
         self.spikes_not_recorded += int(np.count_nonzero(row == UNKNOWN))
         began = np.array(begun, dtype=np.float64)
         return observed_in_frames(start, stop, frames, row, began, FRAMES_PER_S, zero=self._zero_frame)
@@ -256,20 +256,20 @@ class MaxOneCulture(Culture):
         self._switch_power(False)
 
     def _close(self) -> None:
-        mx, wiring = self._mx, self._wiring
+        mx, routing = self._mx, self._routing
         # Whatever fails, the rest is still tried, in reverse order.
         with ExitStack() as steps:
             steps.callback(self._release)
             if self._sequences is not None:
                 steps.callback(self._sequences.delete)
-            if mx is not None and wiring is not None:
-                for unit in wiring.unit_of.values():
+            if mx is not None and routing is not None:
+                for unit in routing.unit_of.values():
                     steps.callback(mx.send, mx.StimulationUnit(unit).power_up(False).connect(False))
             steps.callback(self._switch_power, False)
 
     def _release(self) -> None:
         stream = self._stream
-        # The wiring stays readable; so do `device_limits`, for the next opening.
+        # The routing stays readable; so do `device_limits`, for the next opening.
         self._mx = self._stream = self._sequences = self._guard = None
         if stream is not None:
             # -1 if no frame was received.

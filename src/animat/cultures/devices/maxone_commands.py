@@ -1,4 +1,4 @@
-"""What a MaxOne is told: how electrodes are wired, checked as the device does not, and stimuli as command sequences."""
+"""The commands of a MaxOne: electrodes routed, and checked as the device does not, and stimuli as sequences."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ EVENT_TYPE = 1
 MOST_KEPT = 1000
 
 
-class Wiring(NamedTuple):
+class Routing(NamedTuple):
     """Recording electrodes that were routed, and those that were not; the unit of each stimulation electrode."""
 
     channels: Channels
@@ -42,7 +42,7 @@ class Wiring(NamedTuple):
     unit_of: dict[int, int]
 
 
-def wire(mx: Any, selection: Selection, *, wait: Callable[[str], None]) -> Wiring:
+def route(mx: Any, selection: Selection, *, wait: Callable[[str], None]) -> Routing:
     """Route, connect, check, download, and compensate offsets; the units are left powered but not connected.
 
     `wait` is called after a step with the vendor's name of the waiting time. Raises DeviceFailed, naming the
@@ -72,7 +72,7 @@ def wire(mx: Any, selection: Selection, *, wait: Callable[[str], None]) -> Wirin
     row_of = np.full(AMPLIFIERS, UNKNOWN, dtype=np.int64)
     row_of[amplifier] = np.arange(len(routed))
     not_routed = tuple(electrode for electrode in recording if electrode not in amplifier_of)
-    return Wiring(Channels.on(selection.array, np.array(routed, np.int64), amplifier), row_of, not_routed, unit_of)
+    return Routing(Channels.on(selection.array, np.array(routed, np.int64), amplifier), row_of, not_routed, unit_of)
 
 
 def _routed(array: Any) -> dict[int, int]:
