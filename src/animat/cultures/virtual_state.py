@@ -14,7 +14,7 @@ from jaxtyping import Int64
 
 from animat.cultures.tissue import Tissue
 from animat.cultures.tissue.coupling import Kicks
-from animat.cultures.tissue.kernel import State
+from animat.cultures.tissue.kernel import TissueState
 from animat.cultures.tissue.snapshot import LONGEST_NS, Snapshot, expect_array, expect_rising, expect_whole
 from animat.errors import InvalidArgument, InvalidFile, Mismatch, shown
 from animat.stimulation.array import MAXONE
@@ -74,7 +74,7 @@ def read_state(path: Path, settings: Mapping[str, str], tissue: Tissue) -> Virtu
                     remedy = "continue with the version of animat that wrote it, or start again in another folder"
                 raise Mismatch(f"{path}: expected the state of this culture, got one which differs in {name}: {remedy}")
         kicks = Kicks(*(arrays[f"kicks_{name}"] for name in Kicks._fields))
-        saved = State(*(arrays[f"state_{name}"] for name in State._fields))
+        saved = TissueState(*(arrays[f"state_{name}"] for name in TissueState._fields))
         clock = head["tissue_now_ns"], head["tissue_step"]
         snapshot = Snapshot(tissue.seed, tissue.parameters, *clock, kicks, saved)
         # First, because the other clocks are checked against the tissue's.

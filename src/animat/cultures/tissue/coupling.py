@@ -71,7 +71,7 @@ class Kicks(NamedTuple):
     mv: Float32[np.ndarray, " kicks"]
 
 
-class Coupling:
+class ElectrodeCoupling:
     """The coupling of electrodes to a network, fixed by the seed and the electrodes' positions.
 
     A neuron at distance d is kicked by `kick_mv` f / (1 + (d / `kick_reach_um`)^2), with f its own log-normal factor.
@@ -132,7 +132,7 @@ def _find_reach(
     return Reach(near, kick_mv[near], axons, rank[axons], latency_ms[axons], key[axons])
 
 
-def in_order(*kicks: Kicks) -> Kicks:
+def sorted_kicks(*kicks: Kicks) -> Kicks:
     """All kicks in order of their steps; those of one step keep their order."""
     step, neuron, mv = (np.concatenate(column) for column in zip(*kicks, strict=True))
     order = np.argsort(step, kind="stable")

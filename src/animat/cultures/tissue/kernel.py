@@ -49,7 +49,7 @@ class Wiring(NamedTuple):
     delay_steps: Int32[np.ndarray, " synapses"]
 
 
-class State(NamedTuple):
+class TissueState(NamedTuple):
     """Everything that changes. Columns of `x` and `u` are for excitatory and for inhibitory targets.
 
     `drive` is the noisy drive, `shared` the community's contribution to its mean, in mV; `refractory` the steps left;
@@ -121,7 +121,9 @@ def sum_of_four(bits: np.uint64) -> np.float32:
 
 
 @inlined
-def move_membrane(constants: np.record, state: State, step_over_membrane: Float32[np.ndarray, " neurons"]) -> None:
+def move_membrane(
+    constants: np.record, state: TissueState, step_over_membrane: Float32[np.ndarray, " neurons"]
+) -> None:
     """One step of V, exact for conductances held over the step, up to (1 - exp(-z)) / z = 1 / (1 + z/2 + z^2/12)."""
     v_mv, drive_mv, ampa, nmda, gaba = state.v_mv, state.drive_mv, state.ampa, state.nmda, state.gaba
     potassium, refractory = state.potassium, state.refractory
@@ -149,7 +151,7 @@ def move_membrane(constants: np.record, state: State, step_over_membrane: Float3
 
 @inlined
 def move_noise(
-    constants: np.record, wiring: Wiring, state: State, mean_mv: Float32[np.ndarray, " neurons"], step: int
+    constants: np.record, wiring: Wiring, state: TissueState, mean_mv: Float32[np.ndarray, " neurons"], step: int
 ) -> None:
     """`NOISE_STEPS` of the Ornstein-Uhlenbeck drive, whose noise depends only on the neuron and the step."""
     drive_mv, key = state.drive_mv, wiring.noise_key
@@ -160,7 +162,7 @@ def move_noise(
 
 
 @inlined
-def move_shared(constants: np.record, wiring: Wiring, state: State, step: int) -> None:
+def move_shared(constants: np.record, wiring: Wiring, state: TissueState, step: int) -> None:
     """`SHARED_STEPS` of the slow Ornstein-Uhlenbeck noise that the neurons of a community share."""
     shared_mv = state.shared_mv
     for community in range(shared_mv.size):
@@ -169,7 +171,7 @@ def move_shared(constants: np.record, wiring: Wiring, state: State, step: int) -
 
 
 @inlined
-def fill_mean(wiring: Wiring, state: State, mean_mv: Float32[np.ndarray, " neurons"]) -> None:
+def fill_mean(wiring: Wiring, state: TissueState, mean_mv: Float32[np.ndarray, " neurons"]) -> None:
     """The mean of each neuron's drive: its own constant drive plus the noise of its community."""
     for i in range(mean_mv.size):
         mean_mv[i] = wiring.drive_mv[i] + state.shared_mv[wiring.community[i]]
@@ -190,7 +192,7 @@ def count_down(refractory: Int32[np.ndarray, " neurons"]) -> None:
 
 
 @inlined
-def arrive(constants: np.record, state: State, arrivals: Arrivals, slot: int) -> None:
+def arrive(constants: np.record, state: TissueState, arrivals: Arrivals, slot: int) -> None:
     """Add this step's arrivals to the conductances, and empty its row of the rings."""
     to_ampa, to_nmda, to_gaba = state.arriving_ampa[slot], state.arriving_nmda[slot], state.arriving_gaba[slot]
     for place in range(arrivals.filled[0, slot]):
@@ -206,7 +208,7 @@ def arrive(constants: np.record, state: State, arrivals: Arrivals, slot: int) ->
 
 
 @inlined
-def over_threshold(constants: np.record, state: State, first: int, last: int) -> np.int32:
+def over_threshold(constants: np.record, state: TissueState, first: int, last: int) -> np.int32:
     """Number of neurons from `first` up to `last` above threshold; refractory ones are at the reset potential."""
     v_mv, adaptation_mv, threshold_mv = state.v_mv, state.adaptation_mv, constants.threshold_mv
     count = np.int32(0)
@@ -222,7 +224,7 @@ def recovered(value: float, rest: float, elapsed_s: float, time_constant_s: floa
 
 
 @inlined
-def missing_of(constants: np.record, state: State, i: int, step: int) -> float:
+def missing_of(constants: np.record, state: TissueState, i: int, step: int) -> float:
     """The share of spikes that neuron i's stimulated axon fails to conduct: it follows the load, slowly."""
     since_s = (step - state.last_driven[i]) * constants.step_s
     load_kept, missing_kept = math.exp(-since_s / constants.load_s), math.exp(-since_s / constants.conduction_s)
@@ -231,7 +233,7 @@ def missing_of(constants: np.record, state: State, i: int, step: int) -> float:
 
 
 @inlined
-def conducts(constants: np.record, wiring: Wiring, state: State, i: int, step: int) -> bool:
+def conducts(constants: np.record, wiring: Wiring, state: TissueState, i: int, step: int) -> bool:
     """Whether neuron i's stimulated axon conducts its spike to the soma, which loads the axon."""
     missing = missing_of(constants, state, i, step)
     if uniform(mixed(wiring.axon_key[i], step)) < missing:
@@ -244,7 +246,7 @@ def conducts(constants: np.record, wiring: Wiring, state: State, i: int, step: i
 
 @inlined
 def fire(
-    constants: np.record, wiring: Wiring, state: State, arrivals: Arrivals, i: int, step: int, gain: float
+    constants: np.record, wiring: Wiring, state: TissueState, arrivals: Arrivals, i: int, step: int, gain: float
 ) -> None:
     """Let neuron i spike: release, depress, reduce availability, send along every synapse, reset."""
     kind = 0 if i < constants.n_excitatory else 1
@@ -289,7 +291,7 @@ def fire(
 
 
 @inlined
-def release_of(constants: np.record, state: State, i: int, kind: int, towards: int, elapsed_s: float) -> float:
+def release_of(constants: np.record, state: TissueState, i: int, kind: int, towards: int, elapsed_s: float) -> float:
     """Recover u and x since the last spike, release u x, and store their values after it."""
     use = constants.use[kind, towards]
     x = recovered(state.x[i, towards], 1.0, elapsed_s, constants.recovery_s[kind, towards])
@@ -324,14 +326,14 @@ def advance(
 
     Args:
         record: from `prepare_constants`.
-        wires, values, arriving: plain tuples of `Wiring`, `State` and `Arrivals`; the last two are changed in place.
+        wires, values, arriving: plain tuples of `Wiring`, `TissueState`, `Arrivals`; the last two are changed in place.
         clock: the tissue's clock, in steps, and how many kicks have passed; changed in place, so that an exception
             that follows, as of Ctrl-C, finds it as the state is.
         gain: factor on excitatory weights during this call.
         kick_step, kick_neuron, kick_mv: kicks in order of their steps; none that has not passed is before the clock.
         spike_step, spike_neuron: output, with room for at least one spike per neuron.
     """
-    constants, wiring, state, arrivals = record[0], Wiring(*wires), State(*values), Arrivals(*arriving)
+    constants, wiring, state, arrivals = record[0], Wiring(*wires), TissueState(*values), Arrivals(*arriving)
     n = state.v_mv.size
     last_row = state.arriving_ampa.shape[0] - 1
     mean_mv = np.empty(n, np.float32)

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Shaped
 
 from animat.cultures.tissue import kernel
-from animat.cultures.tissue.kernel import Arrivals, State, Wiring
+from animat.cultures.tissue.kernel import Arrivals, TissueState, Wiring
 from animat.cultures.tissue.network import Network
 from animat.cultures.tissue.parameters import TissueParameters
 
@@ -99,7 +99,7 @@ def prepare_wiring(seed: int, parameters: TissueParameters, network: Network) ->
     )
 
 
-def fresh_state(seed: int, parameters: TissueParameters, network: Network, wiring: Wiring) -> State:
+def fresh_state(seed: int, parameters: TissueParameters, network: Network, wiring: Wiring) -> TissueState:
     """A rested tissue: recovered synapses, no conductances, drive and potential drawn from plausible ranges."""
     rng = np.random.default_rng([seed, 8])
     n = len(network)
@@ -108,7 +108,7 @@ def fresh_state(seed: int, parameters: TissueParameters, network: Network, wirin
     of_excitatory = parameters.e_to_e.use, parameters.e_to_i.use
     use = np.where(network.is_excitatory[:, None], of_excitatory, parameters.i_to_any.use)
 
-    return State(
+    return TissueState(
         v_mv=rng.uniform(parameters.leak_mv, parameters.reset_mv, n).astype(np.float32),
         drive_mv=drive_mv.astype(np.float32),
         shared_mv=np.zeros(parameters.communities, np.float32),
@@ -126,7 +126,7 @@ def fresh_state(seed: int, parameters: TissueParameters, network: Network, wirin
     )
 
 
-def arrivals_of(state: State) -> Arrivals:
+def arrivals_of(state: TissueState) -> Arrivals:
     """The arrivals in a state's rings."""
     is_arriving = np.stack([state.arriving_ampa, state.arriving_gaba]) != 0
     targets_first = np.argsort(~is_arriving, axis=2, kind="stable")

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from animat.cultures.tissue.coupling import Kicks
-from animat.cultures.tissue.kernel import State, Wiring
+from animat.cultures.tissue.kernel import TissueState, Wiring
 from animat.cultures.tissue.parameters import TissueParameters
 from animat.errors import InvalidArgument, shown
 
@@ -29,10 +29,10 @@ class Snapshot:
     now_ns: int
     step: int
     kicks: Kicks
-    state: State
+    state: TissueState
 
 
-def expect_sound(snapshot: Snapshot, like: State, wiring: Wiring, step_ns: int) -> None:
+def expect_sound(snapshot: Snapshot, like: TissueState, wiring: Wiring, step_ns: int) -> None:
     """Refuse a snapshot with a clock, shapes, indices or values that no tissue can have; `like` is such a state."""
     expect_whole("tissue_now_ns", snapshot.now_ns, 0, LONGEST_NS)
     step = snapshot.now_ns // step_ns

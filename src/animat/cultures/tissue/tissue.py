@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from animat.cultures.tissue import kernel
-from animat.cultures.tissue.coupling import NO_KICKS, Coupling, Kicks, Pulse, in_order
-from animat.cultures.tissue.kernel import State
+from animat.cultures.tissue.coupling import NO_KICKS, ElectrodeCoupling, Kicks, Pulse, sorted_kicks
+from animat.cultures.tissue.kernel import TissueState
 from animat.cultures.tissue.network import grow
 from animat.cultures.tissue.parameters import TissueParameters
 from animat.cultures.tissue.preparation import arrivals_of, fresh_state, prepare_constants, prepare_wiring
@@ -72,7 +72,7 @@ class Tissue:
         self._network = network = grow(seed, self.parameters)
         self.x_um, self.y_um = network.x_um.copy(), network.y_um.copy()
         self.is_excitatory = network.is_excitatory.copy()
-        self._coupling = Coupling(seed, self.parameters, self._network)
+        self._coupling = ElectrodeCoupling(seed, self.parameters, self._network)
         self._drift = Drift(seed, self.parameters)
         self._constants = prepare_constants(self.parameters)
         self._wiring = prepare_wiring(seed, self.parameters, self._network)
@@ -105,7 +105,7 @@ class Tissue:
         before = self._kicks_to_come
         if pulses:
             new = [self._kicks_of(pulse, end_ns) for pulse in sorted(pulses, key=lambda pulse: pulse.time_s)]
-            self._set_kicks(in_order(before, *new))
+            self._set_kicks(sorted_kicks(before, *new))
         last_step = end_ns // self.step_ns
         parts = []
         try:
@@ -133,7 +133,7 @@ class Tissue:
 
     def snapshot(self) -> Snapshot:
         """A copy of the state, for `restore`."""
-        state = State(*(values.copy() for values in self._state))
+        state = TissueState(*(values.copy() for values in self._state))
         return Snapshot(self.seed, self.parameters, self._now_ns, self._step, self._kicks_to_come, state)
 
     def restore(self, snapshot: Snapshot) -> None:
@@ -141,7 +141,7 @@ class Tissue:
         if (snapshot.seed, snapshot.parameters) != (self.seed, self.parameters):
             raise Mismatch(f"snapshot: expected one of this tissue, with seed {self.seed}, got one of another")
         expect_sound(snapshot, self._state, self._wiring, self.step_ns)
-        self._adopt(State(*(values.copy() for values in snapshot.state)))
+        self._adopt(TissueState(*(values.copy() for values in snapshot.state)))
         self._now_ns, self._clock[0] = snapshot.now_ns, snapshot.step
         self._set_kicks(snapshot.kicks)
 
@@ -158,7 +158,7 @@ class Tissue:
     def _set_kicks(self, kicks: Kicks) -> None:
         self._kicks, self._clock[1] = kicks, 0
 
-    def _adopt(self, state: State) -> None:
+    def _adopt(self, state: TissueState) -> None:
         self._state = state
         self._run = self._constants, tuple(self._wiring), tuple(state), tuple(arrivals_of(state))
 
