@@ -31,7 +31,7 @@ from animat.evaluation.table import evaluate
 from animat.reality_gap.predicting import ROLL_OUTS, episodes_on_host
 from animat.robots import host, robot_from_dict, robot_named, robot_to_dict
 from animat.robots.gymnasium import GymnasiumRobot
-from animat.robots.host import Bodies, Snapshot
+from animat.robots.host import Bodies, BodiesSnapshot
 from animat.robots.registry import REGISTRY
 from animat.studies.episodes import record_paths
 from animat.training.folder import describe, expect_trainable
@@ -146,7 +146,7 @@ def test_a_snapshot_restores_bodies() -> None:
 
 def test_dependence_on_earlier_episodes_is_reported() -> None:
     robot = named("Remembers")
-    assert not robot.keeps_state and Snapshot.initial(robot, 3).commands.shape == (3, 0, 1)
+    assert not robot.keeps_state and BodiesSnapshot.initial(robot, 3).commands.shape == (3, 0, 1)
     (caveat,) = robot.caveats()
     assert "episodes restart at each checkpoint" in caveat and named("Slider").caveats() == ()
 
@@ -451,7 +451,7 @@ def test_a_limit_of_zero_and_episodes_too_long_to_keep_are_reported() -> None:
         named("Slider", episode_limit=0)
     robot = named("Slider", episode_limit=host.LONGEST_KEPT + 1)
     (caveat,) = robot.caveats()
-    assert "20,001 iterations" in caveat and not Snapshot.initial(robot, 2).commands.size
+    assert "20,001 iterations" in caveat and not BodiesSnapshot.initial(robot, 2).commands.size
 
 
 def test_settings_are_numbers_and_whole_ones_stay_whole() -> None:

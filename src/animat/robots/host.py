@@ -101,7 +101,7 @@ class StepResult(NamedTuple):
         return np.asarray(self.terminated | self.truncated)
 
 
-class Snapshot(NamedTuple):
+class BodiesSnapshot(NamedTuple):
     """The state of several bodies as data, which the seeds of their episodes and the commands since then restore.
 
     Attributes:
@@ -116,7 +116,7 @@ class Snapshot(NamedTuple):
     commands: Float32[np.ndarray, "*some bodies iterations commands"]
 
     @classmethod
-    def initial(cls, robot: HostRobot, bodies: int) -> Snapshot:
+    def initial(cls, robot: HostRobot, bodies: int) -> BodiesSnapshot:
         """The state of bodies that have not begun."""
         kept = robot.episode_limit if robot.keeps_episodes else 0
         observation = np.zeros((bodies, len(robot.observation_spec)), np.float32)
@@ -131,15 +131,15 @@ class Bodies:
         self.robot, self._seeds = robot, [tuple(seed) for seed in seeds]
         make = partial(robot.body, with_pictures=True) if with_pictures else robot.body
         self._bodies = [call_body(robot, "being made", make) for _ in seeds]
-        self._now = Snapshot.initial(robot, len(self._bodies))
+        self._now = BodiesSnapshot.initial(robot, len(self._bodies))
 
     def __len__(self) -> int:
         return len(self._bodies)
 
     @property
-    def snapshot(self) -> Snapshot:
+    def snapshot(self) -> BodiesSnapshot:
         """A copy of their current state."""
-        return Snapshot(*(part.copy() for part in self._now))
+        return BodiesSnapshot(*(part.copy() for part in self._now))
 
     @property
     def observation(self) -> Float32[np.ndarray, "bodies observations"]:
@@ -185,7 +185,7 @@ class Bodies:
         """The first body as it is now; None if it has no picture."""
         return call_body(self.robot, "render", self._bodies[0].picture)
 
-    def restore(self, snapshot: Snapshot) -> bool:
+    def restore(self, snapshot: BodiesSnapshot) -> bool:
         """Bring new bodies to the state of others; returns whether that succeeded: if not, each begins another."""
         for part, kept in zip(self._now, snapshot, strict=True):
             part[...] = kept
@@ -196,7 +196,7 @@ class Bodies:
         self.begin()
         return False
 
-    def _replay(self, body: int, snapshot: Snapshot) -> bool:
+    def _replay(self, body: int, snapshot: BodiesSnapshot) -> bool:
         self._now.episodes[body] -= 1
         self._begin(body)
         observation: Any = self._now.observation[body]

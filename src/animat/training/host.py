@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from animat.compilation import jit_side_by_side
 from animat.environment import Environment, Neurons
 from animat.neurons.history import INITIAL_HISTORY
-from animat.robots.host import Bodies, HostRobot, Snapshot
+from animat.robots.host import Bodies, BodiesSnapshot, HostRobot
 from animat.training.replay import pack_transitions
 from animat.training.sac import Finished, Learner, begin, choose_actions, critic_state, draw_uniforms, end_round, learn
 from animat.training.settings import SAC
@@ -103,7 +103,7 @@ def _compiled(environment: Environment[Any], algorithm: SAC) -> tuple[Callable[.
 class OnHost:
     """`begin` and `train_chunk` of `animat.training.sac` for policies of a robot that is stepped outside JAX.
 
-    Between chunks the learners hold the bodies as data (`Snapshot`), so checkpoints are like those of other robots.
+    Between chunks the learners hold the bodies as data (`BodiesSnapshot`): checkpoints are like those of other robots.
     """
 
     def __init__(self, environment: Environment[Any], algorithm: SAC) -> None:
@@ -117,7 +117,7 @@ class OnHost:
         policy_seeds = np.asarray(jax.random.key_data(keys)).astype(int).tolist()
         self._seeds = [(*seed, body) for seed in policy_seeds for body in range(self._n)]
         learners: Learner = self._beginning(keys)
-        none = Snapshot.initial(self._robot, len(keys) * self._n)
+        none = BodiesSnapshot.initial(self._robot, len(keys) * self._n)
         return learners._replace(episodes=learners.episodes._replace(robot=self._by_policy(none)))
 
     def train(self, learners: Learner, simulator: Neurons, first: Array, last: Array) -> tuple[Learner, Finished]:
@@ -145,7 +145,7 @@ class OnHost:
         if self._bodies is None or not learners.episodes.robot.commands.shape[2]:
             flat = (np.asarray(part).reshape(len(self._seeds), *part.shape[2:]) for part in learners.episodes.robot)
             self._bodies = Bodies(self._robot, self._seeds)
-            is_restored = self._bodies.restore(Snapshot(*flat))
+            is_restored = self._bodies.restore(BodiesSnapshot(*flat))
         episodes = learners.episodes._replace(robot=self._by_policy(self._bodies.observation))
         if not is_restored:
             explored = learners.exploration
