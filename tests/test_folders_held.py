@@ -42,7 +42,7 @@ def command(name: str, folder: Path) -> list[str]:
 def test_a_second_run_is_refused_before_a_culture_is_opened(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("animat.cultures.kinds.culture_of", lambda *_, **__: pytest.fail("a culture was made"))
+    monkeypatch.setattr("animat.cultures.kinds.culture_named", lambda *_, **__: pytest.fail("a culture was made"))
     with exclusive_lock(tmp_path / "in" / "out"):
         assert main(command(name, tmp_path)) == 1
         assert "out: another run is at work in this folder; wait for it, or stop it" in capsys.readouterr().err
@@ -58,7 +58,7 @@ def test_the_folder_is_held_while_a_culture_is_opened_and_taken_away_if_that_fai
             pass
         raise DeviceFailed("the device: it is off")
 
-    monkeypatch.setattr("animat.cultures.kinds.culture_of", failing)
+    monkeypatch.setattr("animat.cultures.kinds.culture_named", failing)
     assert main(command(name, tmp_path)) == 1
     assert "the device: it is off" in capsys.readouterr().err
     assert not (tmp_path / "in").exists()

@@ -18,7 +18,7 @@ from animat.coding.mapping import Thresholds
 from animat.cultures import under_way
 from animat.cultures.base import Culture
 from animat.cultures.budget import Account, Budget, record_within
-from animat.cultures.kinds import recorded_culture
+from animat.cultures.kinds import culture_arguments
 from animat.cultures.observed import Observed
 from animat.cultures.under_way import PartialRecording
 from animat.cultures.virtual import VirtualCulture
@@ -197,7 +197,7 @@ def test_a_virtual_culture_s_state_lies_beside_its_recordings(tmp_path: Path, mo
     begun_s = [60 * each.start_min for each in recordings]
     assert [begun < kept < begun + 60 for begun, kept in zip(begun_s, after[:-1], strict=True)] == [True] * 3
     assert after[-1] == ended_s > 3 * 60
-    known = recorded_culture("virtual", recordings, [tmp_path / "live" / "recordings"])
+    known = culture_arguments("virtual", recordings, [tmp_path / "live" / "recordings"])
     assert known == {"seed": 1, "state": tmp_path / "live" / "recordings" / "culture.state"}
     goes_on = small_culture()
     goes_on.restore_state(known["state"])
@@ -565,7 +565,7 @@ def test_what_cannot_be_is_refused_before_a_culture_is_opened(
     def opened(*_: Any, **__: Any) -> Any:
         raise AssertionError("a culture was made")
 
-    monkeypatch.setattr("animat.cultures.kinds.culture_of", opened)
+    monkeypatch.setattr("animat.cultures.kinds.culture_named", opened)
     monkeypatch.chdir(tmp_path)
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "something").touch()
@@ -607,7 +607,7 @@ def test_from_the_command_line_it_says_what_it_did_and_exits_as_the_loop_ended(
     def gone(culture: FakeCulture, observed: Observed) -> Observed:
         raise DeviceFailed("gone")
 
-    monkeypatch.setattr("animat.cultures.kinds.culture_of", made)
+    monkeypatch.setattr("animat.cultures.kinds.culture_named", made)
     given = ["live", "navigation", "--policies", "2", "--pulses", "1", "--trials", "40", "--speed", "1e6"]
     given += ["--interval-min", "5", "--duration-min", "10", "--episodes", "1", "--json"]
     assert main([*given, "--out", str(tmp_path / "done")]) == 0

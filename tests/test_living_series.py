@@ -26,7 +26,7 @@ from animat.ctrl_c import interruptible
 from animat.cultures.base import Culture
 from animat.cultures.devices.cl1 import CL1_PULSE, CL1Culture
 from animat.cultures.devices.maxone import MaxOneCulture
-from animat.cultures.kinds import culture_of
+from animat.cultures.kinds import culture_named
 from animat.cultures.observed import Observed
 from animat.cultures.replay import ReplayCulture
 from animat.cultures.series import record_series
@@ -315,7 +315,7 @@ def test_a_kill_while_it_is_recorded_closes_the_culture(
         return observed
 
     culture = FakeCulture(fault=kill, at=1)
-    monkeypatch.setattr("animat.cultures.kinds.culture_of", lambda *_, **__: culture)
+    monkeypatch.setattr("animat.cultures.kinds.culture_named", lambda *_, **__: culture)
     before = signal.getsignal(number)
     given = ["--culture", "maxone", "--selection", "x.json", "--trials", "2", "--out", str(tmp_path)]
     assert main(["record", *given]) == 130
@@ -356,8 +356,8 @@ def test_a_seed_below_0_is_refused_before_a_device_is_touched(
     for make in (
         lambda: CL1Culture(seed=-1),
         lambda: ReplayCulture([synthetic_recording(1, channels=32)], seed=-1),
-        lambda: culture_of("maxone", seed=-1, selection="x.json"),
-        lambda: culture_of("virtual", seed=-1),
+        lambda: culture_named("maxone", seed=-1, selection="x.json"),
+        lambda: culture_named("virtual", seed=-1),
     ):
         with pytest.raises(InvalidArgument, match="seed: expected 0 or more, got -1"):
             make()

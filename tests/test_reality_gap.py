@@ -26,7 +26,7 @@ from animat.closed_loop.session import read_session
 from animat.coding.mapping import Linear, Mapping, Thresholds
 from animat.cultures.budget import Account, Budget
 from animat.cultures.devices.cl1 import CL1Culture
-from animat.cultures.kinds import culture_of, pulse_for, recorded_culture
+from animat.cultures.kinds import culture_arguments, culture_named, pulse_for
 from animat.cultures.observed import Observed
 from animat.cultures.replay import ReplayCulture
 from animat.environment import Animat
@@ -1153,7 +1153,7 @@ class TestCommand:
         def opened(*_: Any, **__: Any) -> Any:
             raise AssertionError("a culture was made")
 
-        monkeypatch.setattr("animat.cultures.kinds.culture_of", opened)
+        monkeypatch.setattr("animat.cultures.kinds.culture_named", opened)
 
     def command(self, folder: Path, *more: str) -> int:
         given = [str(folder / "policies"), "--recordings", str(folder / "recordings"), "--out", str(folder / "session")]
@@ -1211,7 +1211,7 @@ class TestCommand:
         self, folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
     ) -> None:
         culture = FakeCulture()
-        monkeypatch.setattr("animat.cultures.kinds.culture_of", lambda *_, **__: culture)
+        monkeypatch.setattr("animat.cultures.kinds.culture_named", lambda *_, **__: culture)
         usage = shutil.disk_usage(folder)
         given = [str(folder / "policies"), "--recordings", str(folder / "recordings"), "--out", str(folder / "new")]
         for free, status in ((1000, 1), (10**9, 0)):
@@ -1230,7 +1230,7 @@ class TestCommand:
             return observed
 
         culture = FakeCulture(fault=kill, at=0)
-        monkeypatch.setattr("animat.cultures.kinds.culture_of", lambda *_, **__: culture)
+        monkeypatch.setattr("animat.cultures.kinds.culture_named", lambda *_, **__: culture)
         before = signal.getsignal(signal.SIGTERM)
         given = ["--recordings", str(folder / "recordings")]
         assert main(["run", str(folder / "policies"), *given, "--out", str(folder / "new")]) == 130
@@ -1245,7 +1245,7 @@ class TestCommand:
             def _close(self) -> None:
                 raise ConnectionResetError("the device is gone")
 
-        monkeypatch.setattr("animat.cultures.kinds.culture_of", lambda *_, **__: Gone())
+        monkeypatch.setattr("animat.cultures.kinds.culture_named", lambda *_, **__: Gone())
         given = [str(folder / "policies"), "--recordings", str(folder / "recordings"), "--episodes", "1"]
         assert main(["run", *given, "--controls", "random", "--out", str(folder / "new")]) == 1
         printed = capsys.readouterr()
@@ -1265,7 +1265,7 @@ class TestCommand:
                 return np.array([[100 + i, 100 + (i + 1 + (i < 3)) % 8, -1] for i in range(8)])
 
         for made, words in ((FakeCulture(), None), (Rewired(), "3 of the 8 sets of electrodes")):
-            monkeypatch.setattr("animat.cultures.kinds.culture_of", lambda *_, made=made, **__: made)
+            monkeypatch.setattr("animat.cultures.kinds.culture_named", lambda *_, made=made, **__: made)
             given = [str(folder / "policies"), "--recordings", str(folder / "recordings"), "--episodes", "1"]
             assert main(["run", *given, "--controls", "random", "--out", str(folder / type(made).__name__)]) == 0
             said = capsys.readouterr().err
@@ -1372,29 +1372,29 @@ class TestCommand:
 
 def test_a_cl1_is_stimulated_through_the_patterns_that_it_was_recorded_with(recordings: list[Recording]) -> None:
     drawn = replace(recordings[0], culture=RecordedCulture("cl1", 7))
-    known = recorded_culture("cl1", [drawn], [])
-    np.testing.assert_array_equal(culture_of("cl1", **known).patterns, CL1Culture(seed=7).patterns)
+    known = culture_arguments("cl1", [drawn], [])
+    np.testing.assert_array_equal(culture_named("cl1", **known).patterns, CL1Culture(seed=7).patterns)
     given = replace(drawn, culture=None)
-    assert recorded_culture("cl1", [given], []) == recorded_culture("virtual", [drawn], []) == {}
+    assert culture_arguments("cl1", [given], []) == culture_arguments("virtual", [drawn], []) == {}
 
 
 def test_another_kind_of_culture_is_another_word(tmp_path: Path, recordings: list[Recording]) -> None:
-    assert culture_of("virtual", seed=3).name == "virtual"
-    assert culture_of("replay", recordings=recordings).name == "replay"
-    assert culture_of("cl1").name == "cl1"
+    assert culture_named("virtual", seed=3).name == "virtual"
+    assert culture_named("replay", recordings=recordings).name == "replay"
+    assert culture_named("cl1").name == "cl1"
     electrodes = np.arange(0, 20_000, 200)
     Selection(MAXONE, electrodes, electrodes[:8], electrodes[:8].reshape(4, 2)).save(tmp_path / "electrodes.json")
-    assert culture_of("maxone", selection=tmp_path / "electrodes.json").name == "maxone"
+    assert culture_named("maxone", selection=tmp_path / "electrodes.json").name == "maxone"
     for kind in ("cl1", "maxone", "virtual"):
-        culture = culture_of(kind, selection=tmp_path / "electrodes.json" if kind == "maxone" else None)
+        culture = culture_named(kind, selection=tmp_path / "electrodes.json" if kind == "maxone" else None)
         limits = culture.device_limits
         pulse = pulse_for(kind)
         assert pulse.kind == limits.kind
         assert abs(pulse.net_charge) <= limits.net_charge
         assert all(abs(phase.charge) <= limits.charge_per_phase for phase in pulse.phases)
     with pytest.raises(InvalidArgument, match=r"selection: expected a file of electrodes for .*'maxone', got none"):
-        culture_of("maxone")
+        culture_named("maxone")
     with pytest.raises(InvalidArgument, match=r"selection: expected none for a culture of kind 'virtual', got .*json"):
-        culture_of("virtual", selection=tmp_path / "electrodes.json")
+        culture_named("virtual", selection=tmp_path / "electrodes.json")
     with pytest.raises(InvalidArgument, match="expected one of"):
-        culture_of("human")  # type: ignore[arg-type]
+        culture_named("human")  # type: ignore[arg-type]

@@ -73,7 +73,7 @@ def small_ones(monkeypatch: pytest.MonkeyPatch) -> None:
             culture.restore_state(state)
         return culture
 
-    monkeypatch.setattr("animat.cultures.kinds.culture_of", small)
+    monkeypatch.setattr("animat.cultures.kinds.culture_named", small)
 
 
 def run(out: Path, policy: Policy, recordings: Path, *more: str) -> int:
@@ -207,7 +207,7 @@ def test_recordings_of_several_pulses_are_refused_before_a_culture_is_made(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.delattr("animat.cultures.kinds.culture_of")
+    monkeypatch.delattr("animat.cultures.kinds.culture_named")
     (tmp_path / "mine.json").write_text(json.dumps({"pulse": (file or WEAK).to_list()}))
     given = [] if file is None else ["--protocol", str(tmp_path / "mine.json")]
     recordings = recorded_by(series, tmp_path / "recordings", *pulses)
@@ -373,7 +373,7 @@ def test_what_recordings_do_not_tell_is_refused_before_a_culture_is_opened(
     (tmp_path / "from elsewhere").mkdir()
     there = replace(recording, stimuli=replace(recording.stimuli, **{lacks: unknown}))
     write_nwb(there, tmp_path / "from elsewhere" / "recording_0000_min.nwb")
-    monkeypatch.delattr("animat.cultures.kinds.culture_of")
+    monkeypatch.delattr("animat.cultures.kinds.culture_named")
     policy = over(tmp_path / "from elsewhere", "pattern")
     assert run(tmp_path / "session", policy, tmp_path / "from elsewhere") == 1
     (said,) = [line for line in capsys.readouterr().err.splitlines() if "condition pattern 0" in line]

@@ -29,7 +29,7 @@ from scipy.stats import mannwhitneyu, ttest_1samp
 
 from animat.cli import main
 from animat.coding.mapping import mapping_named
-from animat.cultures.kinds import recorded_culture
+from animat.cultures.kinds import culture_arguments
 from animat.cultures.virtual import VirtualCulture
 from animat.environment import Animat
 from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch, UnusableData
@@ -375,7 +375,7 @@ def test_a_virtual_culture_s_recordings_are_the_same_files_wherever_it_was_kille
     ]  # fmt: skip
     # From there `animat run` goes on: from after the last recording.
     recordings = tmp_path / "undisturbed" / "recordings"
-    known = recorded_culture("virtual", read_recordings(recordings), [recordings])
+    known = culture_arguments("virtual", read_recordings(recordings), [recordings])
     assert known == {"seed": 1, "state": recordings / "culture.state"}
     later = small_culture(1, rule=rule)
     assert later.restore_state(known["state"]) == {"sessions": 2}

@@ -70,7 +70,7 @@ class Live(StimulationOptions):
 
     def run(self) -> dict[str, Any]:
         from animat.compilation import keep_compilations
-        from animat.cultures.kinds import culture_of
+        from animat.cultures.kinds import culture_named
         from animat.live.plan import Timetable, check_plan
         from animat.live.shadowing import live
         from animat.progress import Bar
@@ -97,7 +97,7 @@ class Live(StimulationOptions):
             ExitStack() as stack,
             exclusive_lock(self.out),
             Bar("culture") as progress,
-            culture_of(
+            culture_named(
                 self.culture, seed=seed, recordings=recordings, selection=self.selection, progress=progress
             ) as culture,
         ):

@@ -57,7 +57,7 @@ class Record(FolderCommand):
     """Folder for the files"""
 
     def run(self) -> dict[str, Any]:
-        from animat.cultures.kinds import culture_of
+        from animat.cultures.kinds import culture_named
         from animat.cultures.series import record_series
         from animat.cultures.under_way import INTERRUPTED
         from animat.progress import Bar
@@ -88,7 +88,7 @@ class Record(FolderCommand):
                 return protocol
 
             series = record_series(
-                lambda: culture_of(
+                lambda: culture_named(
                     self.culture, seed=self.seed, recordings=recordings, selection=self.selection, progress=progress
                 ),
                 # A virtual culture has the usual number of patterns.

@@ -230,13 +230,13 @@ class Run(StimulationOptions):
     def _culture(
         self, recordings: Sequence[Recording], calibrating: Recording, pulse: Pulse, progress: Progress
     ) -> Culture:
-        from animat.cultures.kinds import culture_of, recorded_culture
+        from animat.cultures.kinds import culture_arguments, culture_named
 
-        known = recorded_culture(self.culture, [calibrating], self.recordings)
+        known = culture_arguments(self.culture, [calibrating], self.recordings)
         if self.culture_seed is not None:
             known = {"seed": self.culture_seed}
         state, seed = self.state or known.get("state"), known.get("seed", 1)
-        culture = culture_of(
+        culture = culture_named(
             self.culture, seed=seed, state=state, recordings=recordings, selection=self.selection, progress=progress
         )
         # Checked again once it is open: some devices report their amplitude step only then.

@@ -16,7 +16,7 @@ from animat.stimulation.pulse import BALANCED_PULSE, PUBLISHED_PULSE, Pulse
 CultureKind = Literal["virtual", "replay", "cl1", "maxone"]
 
 
-def culture_of(
+def culture_named(
     kind: CultureKind,
     *,
     seed: int = 1,
@@ -78,8 +78,8 @@ def pulse_for(kind: str, recorded: Pulse | None = None) -> Pulse:
     return BALANCED_PULSE if kind == "maxone" else PUBLISHED_PULSE
 
 
-def recorded_culture(kind: CultureKind, recordings: Sequence[Recording], files: Sequence[Path]) -> dict[str, Any]:
-    """Arguments of `culture_of` that recreate the recorded culture, as far as they are known.
+def culture_arguments(kind: CultureKind, recordings: Sequence[Recording], files: Sequence[Path]) -> dict[str, Any]:
+    """Arguments of `culture_named` that recreate the recorded culture, as far as they are known.
 
     For a virtual culture its seed, and the state written after the recordings; for a CL1 the seed of its patterns.
     """

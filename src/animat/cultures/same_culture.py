@@ -11,7 +11,7 @@ from animat.recordings.recording import Recording
 from animat.tables import UNKNOWN
 
 
-def differences(recording: Recording, culture: Culture, *, patterns_too: bool) -> tuple[Finding, ...]:
+def culture_differences(recording: Recording, culture: Culture, *, patterns_too: bool) -> tuple[Finding, ...]:
     """Warnings where an open culture is not, or not in all, the recorded one; `patterns_too`: if they are used."""
     found = other_culture(recording, culture), other_channels(recording, culture)
     also = (other_patterns(recording, culture),) if patterns_too else ()

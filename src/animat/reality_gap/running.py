@@ -20,7 +20,7 @@ from animat.closed_loop.session import expect_no_session
 from animat.cultures.base import Culture
 from animat.cultures.budget import Account
 from animat.cultures.failures import describe_error
-from animat.cultures.same_culture import differences
+from animat.cultures.same_culture import culture_differences
 from animat.environment import Animat
 from animat.errors import InvalidArgument, InvalidFile, UnusableData, did_you_mean, expect_at_least
 from animat.evaluation import transfer
@@ -226,7 +226,7 @@ def _loop_of(
         settings["remembering"] = calibration.remembering
     loop, unlike_policy = Loop.of_policy(policy, calibration.percentiles, pulses=pulses, **settings)
     if calibration.recording is not None:
-        unknown += differences(calibration.recording, culture, patterns_too=loop.encoder.takes_patterns)
+        unknown += culture_differences(calibration.recording, culture, patterns_too=loop.encoder.takes_patterns)
     return loop, unknown + unlike_policy
 
 
