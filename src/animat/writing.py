@@ -104,12 +104,12 @@ def exclusive_lock(folder: str | os.PathLike[str]) -> Iterator[None]:
         folder.mkdir(parents=True, exist_ok=True)
         descriptors = [os.open(folder, os.O_RDONLY)]
     try:
-        if is_locked(folder, descriptors[0]):
+        if try_lock(folder, descriptors[0]):
             _expect_same(folder, descriptors[0])
         else:
             with suppress(OSError):
                 descriptors.append(os.open(folder / LOCK, os.O_RDWR | os.O_CREAT, 0o666))
-                is_locked(folder, descriptors[1])
+                try_lock(folder, descriptors[1])
         try:
             yield
         except BaseException:
@@ -122,7 +122,7 @@ def exclusive_lock(folder: str | os.PathLike[str]) -> Iterator[None]:
             os.close(descriptor)
 
 
-def is_locked(folder: Path, descriptor: int) -> bool:
+def try_lock(folder: Path, descriptor: int) -> bool:
     """Lock an open folder or file for as long as it is open; False if the file system cannot."""
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)

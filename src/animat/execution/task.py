@@ -79,7 +79,7 @@ def _holding(lock: IO[str]) -> Iterator[None]:
     then written atomically, with the same bytes.
     """
     last_mtime, since_s = 0.0, time.monotonic()
-    while not _has_locked(lock):
+    while not _try_lock(lock):
         if (mtime := os.fstat(lock.fileno()).st_mtime) != last_mtime:
             last_mtime, since_s = mtime, time.monotonic()
         elif time.monotonic() - since_s > SILENT_S:
@@ -100,7 +100,7 @@ def _holding(lock: IO[str]) -> Iterator[None]:
         thread.join()
 
 
-def _has_locked(lock: IO[str]) -> bool:
+def _try_lock(lock: IO[str]) -> bool:
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:

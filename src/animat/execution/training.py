@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import final
 
 from animat.arguments import checked_arguments
-from animat.coding.decoder import expect_fit
+from animat.coding.decoder import expect_readout_per_command
 from animat.devices import gpu_here
 from animat.errors import InvalidArgument, UnusableData
 from animat.execution.curves import CurveFile, Curves, TrainingCallback
@@ -24,7 +24,15 @@ from animat.neurons.timeline import SimulatorTimeline
 from animat.progress import Part, Progress, in_phase
 from animat.robots.host import HostRobot
 from animat.training.course import rows_of
-from animat.training.folder import MANIFEST, describe, expect_trainable, finish, groups_of, is_ours, write_description
+from animat.training.folder import (
+    MANIFEST,
+    check_claim,
+    describe,
+    expect_trainable,
+    finish,
+    groups_of,
+    write_description,
+)
 from animat.training.group import CHECKPOINT_S, Group, train_groups
 from animat.training.policy import Policy
 from animat.training.specification import CHUNKS, Training
@@ -81,7 +89,7 @@ def train(
     expect_workers(workers, executor)
     expect_trainable(training, is_saved=folder is not None)
     if timeline is not None:
-        expect_fit(training.robot.name, training.robot.n_commands, len(timeline.readouts))
+        expect_readout_per_command(training.robot.name, training.robot.n_commands, len(timeline.readouts))
     training = training.with_duration_of(timeline)
     rows_of(training, timeline)
     on_cores = folder is None or executor is not None or isinstance(training.robot, HostRobot)
@@ -93,9 +101,9 @@ def train(
         return _train_in_memory(groups, _phase_of(groups, progress), callbacks)
     folder = Path(folder).absolute()
     # Checked before the lock, so that another training's folder stays untouched.
-    is_ours(folder, manifest)
+    check_claim(folder, manifest)
     with exclusive_lock(folder):
-        if not is_ours(folder, manifest):
+        if not check_claim(folder, manifest):
             write_description(folder, manifest)
         missing = [group for group in groups if not _is_trained(group, folder)]
         curves = Curves(folder, groups, callbacks, _phase_of(missing, progress))

@@ -106,9 +106,9 @@ def claim_folder(
     """
     expect_no_file(folder, f"the {what}")
     files = {file: json.dumps(manifest, indent=1, sort_keys=True) + "\n", **beside}
-    _is_claimed(folder, what, manifest, [*files])
+    _check_claim(folder, what, manifest, [*files])
     with exclusive_lock(folder):
-        if not _is_claimed(folder, what, manifest, [*files]):
+        if not _check_claim(folder, what, manifest, [*files]):
             for name, text in files.items():
                 write_whole(folder / name, text)
         for leftover in [*folder.iterdir(), *(path for name in own_folders for path in (folder / name).rglob("*"))]:
@@ -117,8 +117,8 @@ def claim_folder(
         yield
 
 
-def _is_claimed(folder: Path, what: str, manifest: dict[str, Any], files: list[str]) -> bool:
-    """Whether the folder already belongs to this work, whose description is the first of its files, or is free."""
+def _check_claim(folder: Path, what: str, manifest: dict[str, Any], files: list[str]) -> bool:
+    """Refuse the folder of other work than the manifest's; True if it has all of this work's files, False if free."""
     found = read_description(folder / files[0], what)
     if found is None:
         # Hidden files do not count: they are locks, unfinished files of a killed run, or another program's.

@@ -181,8 +181,8 @@ def _write_assessments(folder: Path, policies: Mapping[str, Policy]) -> None:
     write_whole(folder / TABLE, concat(tables).to_csv(columns=columns, index=False, float_format="%.6g"))
 
 
-def is_ours(folder: Path, manifest: dict[str, Any]) -> bool:
-    """Whether the folder already holds this training; False if it is free; raises Mismatch or InvalidFile otherwise."""
+def check_claim(folder: Path, manifest: dict[str, Any]) -> bool:
+    """Refuse a folder of other work (Mismatch, InvalidFile); True if it holds this training, False if it is free."""
     stored = _stored_description(folder)
     if stored is not None and stored["fingerprint"] != manifest["fingerprint"]:
         difference = first_difference(stored, manifest, ignoring=_NOT_REPORTED, first=_FIRST)
