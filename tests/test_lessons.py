@@ -29,7 +29,7 @@ from animat.robots.base import Quantity, Robot
 from animat.training.course import Course, assess, programs_with_ranges, rows_of
 from animat.training.folder import describe, expect_trainable
 from animat.training.group import Group
-from animat.training.lessons import Lesson, expect_lessons, read_lessons
+from animat.training.lessons import Lesson, check_lessons, read_lessons
 from animat.training.networks import Layer
 from animat.training.policy import Policy, load_policies
 from animat.training.specification import CHUNKS, Training
@@ -488,7 +488,7 @@ def test_a_robot_with_a_goal_is_varied_as_its_body_is() -> None:
     goal = "avoid pole_angle outside -12..12 deg; drive cart_position in -0.1..0.1 m within 20"
     lesson = Lesson(parameters={"pole_length_m": (0.3, 0.5)}, starts={"position_m": (-0.4, 0.4)}, success=0.8)
     bare, aimed = (varied(lesson, robot) for robot in (Cartpole(), with_goal(Cartpole(), goal)))
-    expect_lessons([lesson], with_goal(Cartpole(), goal), draws_recordings=False)
+    check_lessons([lesson], with_goal(Cartpole(), goal), draws_recordings=False)
     keys = jax.random.split(jax.random.key(3), 50)
     plain, with_it = (jax.vmap(each.reset)(keys) for each in (bare, aimed))
     for of_plain, of_body in zip(plain.robot, with_it.robot.robot, strict=True):
@@ -506,4 +506,4 @@ def test_a_robot_with_a_goal_is_varied_as_its_body_is() -> None:
     for of_plain, of_body in zip(after.robot, after_with.robot.robot, strict=True):
         np.testing.assert_array_equal(of_plain, of_body)
     with pytest.raises(InvalidArgument, match="expected parameters of cartpole, got 'goal'"):
-        expect_lessons([Lesson(parameters={"goal": (0.0, 1.0)})], with_goal(Cartpole(), goal), draws_recordings=False)
+        check_lessons([Lesson(parameters={"goal": (0.0, 1.0)})], with_goal(Cartpole(), goal), draws_recordings=False)

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from animat.arguments import check_argument
-from animat.coding.decoder import decode, expect_fit, expect_one_command
+from animat.coding.decoder import decode, expect_one_command, expect_readout_per_command
 from animat.coding.mapping import Mapping
 from animat.errors import InvalidArgument
 from animat.neurons.history import INITIAL_HISTORY
@@ -178,7 +178,7 @@ class Animat(Environment[RobotState]):
         if simulator.n_conditions != self.n_conditions:
             expected = f"expected {simulator.n_conditions}, those of the simulator, got {self.n_conditions}"
             raise InvalidArgument(f"n_conditions: {expected}: make the Animat with n_conditions of the simulator")
-        expect_fit(self.robot.name, self.robot.n_commands, simulator.n_readouts)
+        expect_readout_per_command(self.robot.name, self.robot.n_commands, simulator.n_readouts)
         answer = simulator.answer(action, uniforms[self.robot.noise_size], state.neurons)
         command = decode(self.mapping, answer.rate_hz, simulator.percentiles)
         return Responded(action, answer, command)

@@ -169,7 +169,7 @@ class Run(StimulationOptions):
 
     def _calibration(self, recordings: Sequence[Recording], first: Policy, fit: dict[str, Any]) -> Calibration:
         """The calibration by the recordings' responses, read by the options and otherwise as in the training."""
-        from animat.evaluation.transfer import expect_conditions
+        from animat.evaluation.transfer import expect_same_conditions
         from animat.reality_gap import Calibration
         from animat.responses.extraction import extract_series
 
@@ -184,7 +184,7 @@ class Run(StimulationOptions):
         )
         adaptive = self.thresholds == "adaptive"
         calibration = Calibration.of_series(series, first, at_min=self.at_min, adaptive=adaptive, **fit)
-        expect_conditions(first, calibration.conditions, calibration.readouts)
+        expect_same_conditions(first, calibration.conditions, calibration.readouts)
         return calibration
 
     def _report(self, gap: RealityGap) -> None:

@@ -128,10 +128,10 @@ class Train(SimulatorOptions, JobOptions):
         return self._report(trained, timeline, unused)
 
     def _training(self) -> tuple[Training, str | Readouts]:
-        from animat.coding.decoder import expect_fit
+        from animat.coding.decoder import expect_readout_per_command
         from animat.coding.mapping import mapping_named
         from animat.responses.readouts import ALL, DEFAULT_READOUTS, count_readouts, read_readouts
-        from animat.training.lessons import expect_lessons, read_lessons
+        from animat.training.lessons import check_lessons, read_lessons
         from animat.training.specification import Training
 
         parameters = read_numbers("--parameters", self.parameters)
@@ -147,14 +147,14 @@ class Train(SimulatorOptions, JobOptions):
         usual_readouts = "all" if mapping == "none" else DEFAULT_READOUTS.get(robot.n_commands, "all")
         readouts = read_readouts(self.readouts or usual_readouts)
         if mapping != "none":
-            expect_fit(robot.name, robot.n_commands, count_readouts(readouts))
+            expect_readout_per_command(robot.name, robot.n_commands, count_readouts(readouts))
         elif readouts != ALL:
             raise InvalidArgument(f"--readouts: expected none without neurons, got {self.readouts}")
         else:
             self.expect_no_simulator("without neurons")
         lessons = () if self.lessons is None else read_lessons(self.lessons)
         with in_file(self.lessons or ""):
-            expect_lessons(lessons, robot, draws_recordings=self.shadowing == "drawn")
+            check_lessons(lessons, robot, draws_recordings=self.shadowing == "drawn")
         training = Training(
             robot=robot,
             mapping=None if mapping == "none" else mapping_named(mapping),

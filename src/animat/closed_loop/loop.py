@@ -11,7 +11,7 @@ from jaxtyping import Float32
 from numpy.typing import ArrayLike
 
 from animat.arguments import check_argument
-from animat.coding.decoder import Decoder, expect_fit
+from animat.coding.decoder import Decoder, expect_readout_per_command
 from animat.coding.encoder import Encoder
 from animat.coding.mapping import N_PERCENTILES, Mapping, mapping_to_data
 from animat.errors import InvalidArgument, UnusableData, expect_at_least
@@ -97,7 +97,7 @@ class Loop:
     remembering: HistoryTracker | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
-        expect_fit(self.robot.name, self.robot.n_commands, len(self.readouts))
+        expect_readout_per_command(self.robot.name, self.robot.n_commands, len(self.readouts))
         given, percentiles = self.percentiles, read_only(self, "percentiles", np.float32)
         if percentiles.shape != self.decoder.percentiles_shape or not np.all(np.diff(percentiles) >= 0):
             each = f" for each of {len(self.readouts)} readouts" if len(self.readouts) > 1 else ""

@@ -47,7 +47,7 @@ def decode(mapping: Mapping, x: Numbers, percentiles: Numbers) -> Numbers:
     return namespace_of(x, percentiles).stack(commands, axis=-1)
 
 
-def expect_fit(robot: str, n_commands: int, readouts: int) -> None:
+def expect_readout_per_command(robot: str, n_commands: int, readouts: int) -> None:
     """Raise InvalidArgument if the number of readouts differs from the number of commands that a robot takes."""
     # An invalid number of commands is reported by the check of the robot.
     if type(n_commands) is int and n_commands > 0 and n_commands != readouts:

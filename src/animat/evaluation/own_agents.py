@@ -64,7 +64,7 @@ def _actor_of(agent: Actor | Controller, environment: Environment[Any], simulato
     has_neurons = len(environment.observation_spec) > len(environment.robot.observation_spec)
     if isinstance(agent, Actor):
         actor = RobotOnly(agent) if has_neurons else agent
-        _expect_actions(actor, environment, simulator)
+        _check_actions(actor, environment, simulator)
         return actor
     if sees_neurons(agent) and not has_neurons:
         got = "one with neural_observation, which these policies do not have"
@@ -77,7 +77,7 @@ def _actor_of(agent: Actor | Controller, environment: Environment[Any], simulato
     return called
 
 
-def _expect_actions(actor: Actor, environment: Environment[Any], simulator: Neurons) -> None:
+def _check_actions(actor: Actor, environment: Environment[Any], simulator: Neurons) -> None:
     """Raise InvalidArgument for an actor that raises, or returns impossible actions, which JAX would not refuse."""
     parts = [np.shape(part) for part in jax.tree.leaves(actor)]
     if jax.tree.leaves(actor) == [actor]:

@@ -129,7 +129,7 @@ NAMES = (UNKNOWN, "other-presentation", "other-calibration", "old-calibration", 
 user chooses the simulator that predicts, and a loop has none."""
 
 
-def expect_conditions(policy: Policy, conditions: Sequence[Condition], readouts: Readouts) -> None:
+def expect_same_conditions(policy: Policy, conditions: Sequence[Condition], readouts: Readouts) -> None:
     """Raise Mismatch unless conditions, stimuli and readouts are those of a policy's training."""
     if policy.conditions != tuple(conditions):
         raise Mismatch(
@@ -144,8 +144,8 @@ def expect_conditions(policy: Policy, conditions: Sequence[Condition], readouts:
 
 
 def timeline_differences(policy: Policy, timeline: SimulatorTimeline) -> Iterator[Finding]:
-    """Differences between simulators and those that a policy was trained on; errors as in `expect_conditions`."""
-    expect_conditions(policy, timeline.conditions, timeline.readouts)
+    """Differences between simulators and those that a policy was trained on; errors as in `expect_same_conditions`."""
+    expect_same_conditions(policy, timeline.conditions, timeline.readouts)
     if policy.window_ms != timeline.window_ms:
         trained, these = describe_window(policy.window_ms), describe_window(timeline.window_ms)
         message = f"the policies were trained on responses {trained}, but these are {these}"

@@ -14,7 +14,7 @@ import numpy as np
 from gymnasium import spaces
 
 from animat.coding.checking import check_mapping
-from animat.coding.decoder import expect_fit
+from animat.coding.decoder import expect_readout_per_command
 from animat.coding.mapping import Mapping, mapping_named
 from animat.environment import Animat, Environment
 from animat.errors import InvalidArgument, did_you_mean, expect_kind, expect_several
@@ -143,7 +143,7 @@ def set_up(
     expect_kind("neural_observation", neural_observation, bool, "True or False")
     if delivery not in ("chosen", "shuffled"):
         raise InvalidArgument(f"delivery: expected 'chosen' or 'shuffled', got {delivery!r}")
-    expect_fit(body.name, body.n_commands, simulator.n_readouts)
+    expect_readout_per_command(body.name, body.n_commands, simulator.n_readouts)
     chosen = mapping if isinstance(mapping, Mapping) else mapping_named(mapping)
     if not is_ours(chosen):
         check_mapping(chosen)

@@ -116,7 +116,7 @@ def run_policies(
     _expect_open(settings)
     # Before minutes of prediction.
     expect_no_session(folder)
-    transfer.expect_conditions(representative, calibration.conditions, calibration.readouts)
+    transfer.expect_same_conditions(representative, calibration.conditions, calibration.readouts)
     loop, findings = _loop_of(representative, culture, calibration, pulses, settings)
     age_min, starts = calibration.age_min(culture), _starts(loop.robot, seed, episodes)
     called = [name for name, agent in (agents or {}).items() if not isinstance(agent, Actor)]

@@ -20,7 +20,7 @@ from animat.responses.readouts import count_readouts, readouts_named
 from animat.robots.base import MOST_AT_ONCE, MOST_ITERATIONS, Robot
 from animat.robots.registry import REGISTRY, robot_named
 from animat.studies.source import LISTED, Source
-from animat.training.lessons import Lesson, expect_lessons
+from animat.training.lessons import Lesson, check_lessons
 from animat.training.settings import SAC, Policies, Shadowing
 
 MOST_TRAINED = 20_000
@@ -125,7 +125,7 @@ class RobotSpec:
             robot = robot_named(self.kind or self.name, **self.parameters)
         if self.name == "culture":
             raise InvalidArgument("name: expected a name other than that of the culture's figures, got 'culture'")
-        expect_lessons(self.lessons, self.robot(), draws_recordings=True)
+        check_lessons(self.lessons, self.robot(), draws_recordings=True)
         if not is_ours(robot):
             # Workers import it from there.
             object.__setattr__(self, "kind", place_of(kind))
@@ -305,7 +305,7 @@ class Study:
             for arm in self.arms:
                 drawn = arm.shadowing == "drawn" and arm.through_neurons
                 try:
-                    expect_lessons(spec.lessons, robot, draws_recordings=drawn)
+                    check_lessons(spec.lessons, robot, draws_recordings=drawn)
                 except InvalidArgument as error:
                     raise InvalidArgument(f"robots.lessons: {error} ({spec.name}, {arm.name})") from error
 

@@ -87,7 +87,7 @@ def stages_of(lessons: Sequence[Lesson]) -> tuple[Lesson, ...]:
     return (*lessons, *[Lesson(name="the task itself")] * (not lessons or lessons[-1].has_threshold))
 
 
-def expect_lessons(lessons: Sequence[Lesson], robot: Robot[Any], *, draws_recordings: bool) -> None:
+def check_lessons(lessons: Sequence[Lesson], robot: Robot[Any], *, draws_recordings: bool) -> None:
     """Refuse lessons that do not fit this robot."""
     if lessons and isinstance(robot, HostRobot):
         raise InvalidArgument(f"lessons: expected a robot that is stepped by JAX, got {robot.name}")
@@ -95,10 +95,10 @@ def expect_lessons(lessons: Sequence[Lesson], robot: Robot[Any], *, draws_record
         with within(f"lesson {number} ({lesson.name})" if lesson.name else f"lesson {number}"):
             if number < len(lessons) and not lesson.has_threshold:
                 raise InvalidArgument("expected success or until_return, to move on to the next lesson, got neither")
-            _expect_lesson(lesson, robot, draws_recordings)
+            _check_lesson(lesson, robot, draws_recordings)
 
 
-def _expect_lesson(lesson: Lesson, robot: Robot[Any], draws_recordings: bool) -> None:
+def _check_lesson(lesson: Lesson, robot: Robot[Any], draws_recordings: bool) -> None:
     if lesson.success is not None and not hasattr(robot, "succeeded"):
         got = f"{robot.name}, which has no method `succeeded`; use until_return"
         raise InvalidArgument(f"success: expected a robot that reports success, got {got}")

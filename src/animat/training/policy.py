@@ -17,7 +17,7 @@ from jaxtyping import Float, Float32, Float64
 from pydantic import Field
 
 from animat.arguments import checked_arguments
-from animat.coding.decoder import expect_fit, expect_one_command
+from animat.coding.decoder import expect_one_command, expect_readout_per_command
 from animat.coding.mapping import REGISTRY as MAPPINGS
 from animat.coding.mapping import Mapping, mapping_from_data, mapping_to_data
 from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch, expect_kind, in_file, shown
@@ -33,7 +33,7 @@ from animat.robots.base import LARGEST_SCALE, LEAST_SCALE, Robot
 from animat.robots.registry import REGISTRY as ROBOTS
 from animat.stimulation.protocol import Presentation
 from animat.tables import briefly, read_only_copy
-from animat.training.settings import PulseCost, expect_provenance
+from animat.training.settings import PulseCost, check_provenance
 from animat.writing import write_whole
 
 FORMAT = "animat-policy-1"
@@ -107,7 +107,7 @@ class Policy:
         vars(self)["neural_observation"] = read_record(Flag, self.neural_observation, "neural_observation")
         if self.neural_observation and self.mapping is None:
             raise InvalidArgument("neural_observation: expected only with a mapping, got no mapping")
-        self._expect_network()
+        self._check_network()
         if self.window_ms is not None:
             check_window(read_record(tuple[Number, Number], self.window_ms, "window_ms"))
         if self.commands is not None:
@@ -117,16 +117,16 @@ class Policy:
             raise InvalidArgument(f"learning_curve: expected rows of six, got shape {self.learning_curve.shape}")
         if self.assessments.ndim != 2 or self.assessments.shape[1] != 5 or self.assessments.dtype.kind != "f":
             raise InvalidArgument(f"assessments: expected rows of five, got shape {self.assessments.shape}")
-        expect_provenance(self.provenance)
+        check_provenance(self.provenance)
         # Read-only, so that a checked policy cannot be changed.
         for name in ("weights", "biases"):
             vars(self)[name] = tuple(map(read_only_copy, getattr(self, name)))
         for name in ("scales", "learning_curve", "assessments"):
             vars(self)[name] = read_only_copy(getattr(self, name))
         if self.mapping is not None:
-            expect_fit(self.robot.name, self.robot.n_commands, len(self.readouts))
+            expect_readout_per_command(self.robot.name, self.robot.n_commands, len(self.readouts))
 
-    def _expect_network(self) -> None:
+    def _check_network(self) -> None:
         """Refuse weights whose shapes do not fit together, or that are not finite."""
         n_outputs = 2 * self.robot.n_commands if self.n_actions is None else self.n_actions
         n_inputs = len(self.robot.observation_spec) + len(INITIAL_HISTORY) * self.neural_observation

@@ -121,7 +121,7 @@ class Provenance(TypedDict, total=False):
     culture: RecordedCulture | None
 
 
-def expect_provenance(provenance: Any) -> None:
+def check_provenance(provenance: Any) -> None:
     """Refuse a provenance with an invalid entry among those that are read."""
     trained = read_record(Provenance, provenance, "provenance").get("training") or {}
     # `Policy.trained_until_min` needs both.

@@ -23,7 +23,7 @@ from animat.registry import is_ours
 from animat.robots.base import MOST_ITERATIONS, Robot
 from animat.robots.host import HostRobot
 from animat.robots.registry import register_robot, robot_named
-from animat.training.lessons import EPISODES, MOST_EPISODES, Lesson, expect_lessons
+from animat.training.lessons import EPISODES, MOST_EPISODES, Lesson, check_lessons
 from animat.training.settings import SAC, Policies, PulseCost, Shadowing
 from animat.wrappers import Delivery, NeuralObservation, ShuffledDelivery, TrialCosts
 
@@ -125,7 +125,7 @@ class Training:
             expect_one_command(self.robot.name, self.robot.n_commands)
         if self.neural_observation and self.mapping is None:
             raise InvalidArgument("neural_observation: expected only with a mapping, got no mapping")
-        expect_lessons(self.lessons, self.robot, draws_recordings=self.shadowing == "drawn")
+        check_lessons(self.lessons, self.robot, draws_recordings=self.shadowing == "drawn")
         if self.pulse_cost and self.mapping is None:
             raise InvalidArgument(f"pulse_cost: expected 0 without neurons, got {self.pulse_cost:g}")
         if self.pulse_cost and self.episodes_assessed:

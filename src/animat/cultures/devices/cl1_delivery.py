@@ -94,11 +94,11 @@ class CL1Session:
             channels += [spike.channel for spike in analysis.spikes]
             for pulse in sorted(analysis.stims, key=lambda pulse: pulse.timestamp):
                 reported[pulse.channel].append(pulse.timestamp)
-            self._check_going(len(queued), len(stimuli))
+            self._expect_going(len(queued), len(stimuli))
             while waiting and requested[len(queued)] + late < stop + AHEAD_FRAMES:
                 # A stop from another thread comes either before the pulse is queued, or after, and then removes it.
                 with self._lock:
-                    self._check_going(len(queued), len(stimuli))
+                    self._expect_going(len(queued), len(stimuli))
                     frame = self._queue(waiting.popleft(), requested[len(queued)] + late)
                 late = frame - requested[len(queued)]
                 queued.append(frame)
@@ -114,7 +114,7 @@ class CL1Session:
         observed = observed_in_frames(start, stop, frame_of, row, np.array(began, np.float64), FRAMES_PER_S)
         return observed, int(np.count_nonzero(row == UNKNOWN)), int(np.count_nonzero(is_late))
 
-    def _check_going(self, queued: int, total: int) -> None:
+    def _expect_going(self, queued: int, total: int) -> None:
         if total and self._halted.is_set():
             sent = f"{queued} of {total} stimuli had been sent to the device"
             raise DeviceFailed(f"CL1: stopped while delivering: {sent}, and what had not begun was interrupted")
