@@ -25,7 +25,7 @@ def freeze(table: object, name: str, **dtypes: Any) -> None:
     """Turn the named attributes into read-only arrays of these types and of equal length."""
     length = None
     for attribute, dtype in dtypes.items():
-        array = read_only(table, attribute, dtype)
+        array = freeze_one(table, attribute, dtype)
         # Only sets of electrodes have a second dimension, which their table checks.
         is_column = array.ndim == 1 or (attribute == "electrodes" and array.ndim > 0)
         if not is_column or length not in (None, len(array)):
@@ -34,7 +34,7 @@ def freeze(table: object, name: str, **dtypes: Any) -> None:
         length = len(array)
 
 
-def read_only(table: object, attribute: str, dtype: Any = None) -> np.ndarray[Any, Any]:
+def freeze_one(table: object, attribute: str, dtype: Any = None) -> np.ndarray[Any, Any]:
     """Turn an attribute of a frozen dataclass into a read-only array, and return it; refuse to truncate numbers."""
     value = getattr(table, attribute)
     try:

@@ -25,7 +25,7 @@ from animat.responses.windows import DEFAULT_WINDOW_MS, check_window
 from animat.robots.base import Robot
 from animat.stimulation.protocol import Presentation
 from animat.stimulation.pulse import PUBLISHED_PULSE, Pulse
-from animat.tables import read_only
+from animat.tables import freeze_one
 from animat.training.policy import Policy
 
 OnBurst = Literal["use", "repeat", "skip"]
@@ -98,7 +98,7 @@ class Loop:
 
     def __post_init__(self) -> None:
         expect_readout_per_command(self.robot.name, self.robot.n_commands, len(self.readouts))
-        given, percentiles = self.percentiles, read_only(self, "percentiles", np.float32)
+        given, percentiles = self.percentiles, freeze_one(self, "percentiles", np.float32)
         if percentiles.shape != self.decoder.percentiles_shape or not np.all(np.diff(percentiles) >= 0):
             each = f" for each of {len(self.readouts)} readouts" if len(self.readouts) > 1 else ""
             raise InvalidArgument(f"percentiles: expected {N_PERCENTILES} rising numbers in Hz{each}, got {given}")

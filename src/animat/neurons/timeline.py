@@ -40,7 +40,7 @@ from animat.responses.quality.one_culture import series_findings, series_mismatc
 from animat.responses.readouts import ALL, Readouts
 from animat.responses.responses import Responses
 from animat.stimulation.protocol import Presentation
-from animat.tables import briefly, read_only
+from animat.tables import briefly, freeze_one
 from animat.writing import write_whole
 
 SimulatorKind = Literal["histogram", "empirical", "memory"]
@@ -98,7 +98,7 @@ class SimulatorTimeline:
     culture: RecordedCulture | None = None
 
     def __post_init__(self) -> None:
-        read_only(self, "start_min", np.float64)
+        freeze_one(self, "start_min", np.float64)
 
     def __len__(self) -> int:
         return len(self.start_min)

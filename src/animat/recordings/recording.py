@@ -19,7 +19,7 @@ from animat.stimulation.array import ElectrodeArray
 from animat.stimulation.protocol import Presentation, Protocol
 from animat.stimulation.pulse import Pulse
 from animat.stimulation.stimulus import Stimuli
-from animat.tables import CENTURY_S, FASTEST_HZ, briefly, expect_rising_times, freeze, read_only, reduce_dataclass
+from animat.tables import CENTURY_S, FASTEST_HZ, briefly, expect_rising_times, freeze, freeze_one, reduce_dataclass
 
 ResponseKind = Literal["count", "rate_hz"]
 
@@ -126,7 +126,7 @@ class Recording:
         if np.any((np.diff(self.spike_times_s) == 0) & (np.diff(self.spike_channels) < 0)):
             order = np.lexsort((self.spike_channels, self.spike_times_s))
             object.__setattr__(self, "spike_channels", self.spike_channels[order])
-            read_only(self, "spike_channels")
+            freeze_one(self, "spike_channels")
         # Events up to a century before and after 0 are up to two centuries apart.
         if not (abs(self.start_s) <= CENTURY_S and 0 <= self.duration_s <= 2 * CENTURY_S):
             length = ", the latter 0 or more" if self.duration_s < 0 else ""
@@ -199,7 +199,7 @@ class ResponseTable:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "provenance", MappingProxyType(dict(self.provenance)))
-        values = read_only(self, "values", np.float64)
+        values = freeze_one(self, "values", np.float64)
         shape = (len(self.stimuli), len(self.channels))
         if values.shape != shape:
             raise UnusableData(f"responses: expected rows of stimuli, columns of channels, {shape}, got {values.shape}")

@@ -18,7 +18,7 @@ from animat.responses.condition import Condition
 from animat.responses.conditions import NO_CONDITION
 from animat.responses.readouts import ALL, Readouts
 from animat.stimulation.protocol import Presentation
-from animat.tables import briefly, read_only
+from animat.tables import briefly, freeze_one
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -44,7 +44,7 @@ class Trials:
 
     def __post_init__(self) -> None:
         for name, column in vars(self).items():
-            if column is not None and (shape := read_only(self, name).shape) != (len(self.condition),):
+            if column is not None and (shape := freeze_one(self, name).shape) != (len(self.condition),):
                 raise Mismatch(f"presented.{name}: expected {len(self.condition)} values, got {shape}")
 
 
@@ -109,7 +109,7 @@ class Responses:
         shape = (len(self),)
         columns = {"condition": np.int64, "rate_hz": np.float64, "active_ratio": np.float64, "is_burst": np.bool_}
         for name, dtype in (columns | {"time_s": np.float64, "place": np.int64}).items():
-            if getattr(self, name) is not None and (got := read_only(self, name, dtype).shape) != shape:
+            if getattr(self, name) is not None and (got := freeze_one(self, name, dtype).shape) != shape:
                 raise Mismatch(f"responses.{name}: expected {len(self)} values, one per response, got {got}")
         if not np.all(np.isfinite(self.rate_hz)):
             raise UnusableData("responses.rate_hz: expected finite numbers, got NaN or infinite ones")
@@ -117,7 +117,7 @@ class Responses:
             raise Mismatch("responses.readout_hz: expected if, and only if, readouts are groups of channels")
         if self.readout_hz is not None:
             expected = shape if len(self.readouts) == 1 else (len(self), len(self.readouts))
-            if (got := read_only(self, "readout_hz", np.float64).shape) != expected:
+            if (got := freeze_one(self, "readout_hz", np.float64).shape) != expected:
                 raise Mismatch(f"responses.readout_hz: expected shape {expected}, got {got}")
         if (self.presented is None) != (self.place is None):
             raise Mismatch("responses.presented, responses.place: expected both or neither, got one")

@@ -20,7 +20,7 @@ from animat.records import Number, Whole, json_data, read_record, record
 from animat.stimulation.array import ElectrodeArray, Electrodes, OfElectrodes
 from animat.stimulation.patterns import Patterns, draw_patterns
 from animat.stimulation.scan import ScannedActivity
-from animat.tables import briefly, read_only
+from animat.tables import briefly, freeze_one
 from animat.writing import write_whole
 
 _MOST_BYTES = 2**24
@@ -94,7 +94,7 @@ class Selection:
 
     def __post_init__(self) -> None:
         for name, dimensions in (("recording", 1), ("stimulation", 1), ("patterns", 2)):
-            electrodes = read_only(self, name, np.int64)
+            electrodes = freeze_one(self, name, np.int64)
             if electrodes.ndim != dimensions:
                 raise InvalidArgument(f"selection.{name}: expected {dimensions} dimensions, got {electrodes.shape}")
             self.array.position_um(electrodes.ravel())
