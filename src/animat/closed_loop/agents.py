@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Float64
 
 from animat.environment import Animat, Environment
 from animat.errors import InvalidArgument, shown
-from animat.evaluation.controllers import Called, Controller, acts, sees_neurons
+from animat.evaluation.controllers import Called, Controller, can_act, sees_neurons
 from animat.evaluation.controls import RANDOM, Control, Delivered
 from animat.evaluation.rollouts import Actor, Constant, Networks, Uniform
 
@@ -109,7 +109,7 @@ class Agent:
             raise InvalidArgument(f"{self.name}: delivery: expected one of {kinds}, got {self.delivery!r}")
         controllers = self.controller.values() if isinstance(self.controller, Mapping) else (self.controller,)
         for controller in controllers:
-            if not acts(controller):
+            if not can_act(controller):
                 raise InvalidArgument(f"{self.name}: controller: expected a method `act`, got {shown(controller)}")
 
     def sees_neurons(self, turn: int) -> bool:

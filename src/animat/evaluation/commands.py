@@ -115,7 +115,7 @@ def mean_commands(
     return of_one.actions, np.sum(of_one.levels * of_one.probabilities, axis=1)
 
 
-def memory_of(environment: Environment[Any], simulator: Neurons) -> MemorySimulator | None:
+def memory_simulator(environment: Environment[Any], simulator: Neurons) -> MemorySimulator | None:
     """The simulator, whose history is distinguished by class; None without memory; refuses a custom memory."""
     if not isinstance(unwrapped(environment), Animat) or simulator is None or not simulator.has_memory:
         return None
@@ -141,7 +141,7 @@ def commands_after(environment: Environment[Any], simulator: Neurons) -> list[li
     (`class_of`): 8 histories represent a class, and 2048 draws after each of them its responses. Without memory there
     is one class, with the commands of `commands_of`.
     """
-    animat, memory = unwrapped(environment), memory_of(environment, simulator)
+    animat, memory = unwrapped(environment), memory_simulator(environment, simulator)
     if memory is None:
         return [[commands_of(environment, simulator)]]
     assert isinstance(animat, Animat)

@@ -29,7 +29,7 @@ class Controller(Protocol):
         """The index of the condition to present, for the robot's observation in its own units."""
 
 
-def acts(controller: object) -> bool:
+def can_act(controller: object) -> bool:
     """Whether an object is a controller: it has a method `act`, or `begin`, which returns one for an episode."""
     return any(callable(getattr(controller, name, None)) for name in ("act", "begin"))
 

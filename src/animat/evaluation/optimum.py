@@ -16,7 +16,7 @@ from jaxtyping import Float, Float32, Float64, Int32, UInt16
 from animat.arguments import checked_arguments
 from animat.environment import Animat, Environment, Neurons, WithoutNeurons
 from animat.errors import InvalidArgument, Mismatch
-from animat.evaluation.commands import CLASSES, class_of, commands_after, memory_of, nodes_for
+from animat.evaluation.commands import CLASSES, class_of, commands_after, memory_simulator, nodes_for
 from animat.evaluation.landings import Motion, Outcomes, side_by_side
 from animat.evaluation.statistics import Interval, standard_error
 from animat.evaluation.sweeping import bellman_backup, cubic, fill_row_weights, look_ahead
@@ -168,7 +168,7 @@ def best_returns(
     coarse = fine.scaled(COARSER, periodic=True)
     progress = Silent() if progress is None else progress
 
-    layers = max(1 if memory_of(*case) is None else CLASSES for case in cases)
+    layers = max(1 if memory_simulator(*case) is None else CLASSES for case in cases)
     kept_mib = 2 * fine.size * layers * robot.episode_limit / 2**20
     if episodes and kept_mib > _MOST_MIB:
         most, took = f"{_MOST_MIB / 1024:g} GiB", f"{resolution:g}, which takes {kept_mib / 1024:.3g} GiB"
@@ -323,7 +323,7 @@ class _Programme:
 
     def _layer_at(self, case: int, history: Float[Any, "episodes 2"]) -> Int32[np.ndarray, " episodes"]:
         """The layer of each episode among those of a case, by its history."""
-        memory = memory_of(*self._cases[case])
+        memory = memory_simulator(*self._cases[case])
         return np.zeros(len(history), np.int32) if memory is None else np.asarray(class_of(memory, history), np.int32)
 
     def _mean_over(self, values: Float32[np.ndarray, "rows cases nodes"], states: Any) -> Float64[np.ndarray, " cases"]:

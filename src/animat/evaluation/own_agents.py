@@ -13,7 +13,7 @@ from jaxtyping import Array
 
 from animat.environment import Environment, Neurons
 from animat.errors import InvalidArgument, first_line, shown, some_of, within
-from animat.evaluation.controllers import Called, CalledEpisodes, Controller, acts, expect_condition, sees_neurons
+from animat.evaluation.controllers import Called, CalledEpisodes, Controller, can_act, expect_condition, sees_neurons
 from animat.evaluation.controls import OWN, Control
 from animat.evaluation.rollouts import Actor, Seen, Uniforms, trajectories
 from animat.registry import imported
@@ -59,7 +59,7 @@ def controls_of_own(
 def _actor_of(agent: Actor | Controller, environment: Environment[Any], simulator: Neurons) -> Actor | Called:
     if isinstance(agent, type):
         raise InvalidArgument(f"expected an instance, got the class {agent.__name__}: create one")
-    if not acts(agent):
+    if not can_act(agent):
         raise InvalidArgument(f"expected an Actor, or a method `act`, got {shown(agent)}")
     has_neurons = len(environment.observation_spec) > len(environment.robot.observation_spec)
     if isinstance(agent, Actor):
