@@ -34,7 +34,7 @@ from animat.robots.gymnasium import GymnasiumRobot
 from animat.robots.host import Bodies, BodiesSnapshot
 from animat.robots.registry import REGISTRY
 from animat.studies.episodes import record_paths
-from animat.training.folder import describe, expect_trainable
+from animat.training.folder import describe_training, expect_trainable
 from animat.training.group import Group
 from animat.training.host import OnHost
 from animat.training.policy import Policy
@@ -191,7 +191,7 @@ def test_stopped_and_started_again_it_ends_in_the_same_bits(
 ) -> None:
     timeline = None if mapping is None else timeline_of()
     asked = training(named(name), mapping, iterations=iterations)
-    description = describe(asked, timeline)
+    description = describe_training(asked, timeline)
     group = Group(asked, (0, 1), timeline, description["fingerprint"], {})
     undisturbed = train_group(group, None, Stopping(10**9))
     checkpoint = tmp_path / "checkpoint.npz"
@@ -306,7 +306,7 @@ def test_episodes_that_would_never_end_are_refused_before_training() -> None:
 
 
 def test_versions_of_all_packages_behind_a_body_are_reported() -> None:
-    description = describe(Training(robot_named("gymnasium:Pendulum-v1"), None), None)
+    description = describe_training(Training(robot_named("gymnasium:Pendulum-v1"), None), None)
     assert description["versions"]["gymnasium"] == importlib.metadata.version("gymnasium")
     assert description["versions"]["learner"] == f"revision {LEARNER}"
 

@@ -30,7 +30,7 @@ from animat.studies.episodes import episode_rows, goals_met, read_episodes, writ
 from animat.studies.folder import describe_study
 from animat.studies.specification import Arm, RobotSpec, Study
 from animat.studies.toml import read_study, study_to_toml
-from animat.training.folder import describe, expect_folder_for, write_description
+from animat.training.folder import describe_training, expect_folder_for, write_description
 from animat.training.policy import Policy
 from animat.training.sac import begin, train_chunk
 from animat.training.settings import SAC
@@ -71,7 +71,7 @@ def test_policies_carry_their_goal_and_are_evaluated_with_it(tmp_path: Path) -> 
     trained = train(training, None, None)
     trained["p0"].save(tmp_path / "p0.safetensors")
     assert Policy.load(tmp_path / "p0.safetensors").robot == robot
-    write_description(tmp_path, describe(training, None))
+    write_description(tmp_path, describe_training(training, None))
     expect_folder_for(training, tmp_path)
     with pytest.raises(Mismatch, match="goal"):
         expect_folder_for(replace(training, robot=with_goal("cartpole", GOAL + " weight 2")), tmp_path)
@@ -89,7 +89,7 @@ def test_policies_carry_their_goal_and_are_evaluated_with_it(tmp_path: Path) -> 
 
 def test_a_fingerprint_includes_the_goal() -> None:
     trainings = [Training(robot, None) for robot in (Cartpole(), with_goal("cartpole", GOAL))]
-    assert len({describe(each, None)["fingerprint"] for each in trainings}) == 2
+    assert len({describe_training(each, None)["fingerprint"] for each in trainings}) == 2
     studies = [Study(robots=(RobotSpec("cartpole", goal=goal),)) for goal in (None, GOAL)]
     assert len({describe_study(each, {})["fingerprint"] for each in studies}) == 2
 

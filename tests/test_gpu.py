@@ -36,7 +36,7 @@ from animat.studies.run import plan_study
 from animat.studies.source import Source
 from animat.studies.toml import read_study
 from animat.studies.training import TrainArm
-from animat.training.folder import describe
+from animat.training.folder import describe_training
 from animat.training.group import Group, SideBySide, train_groups
 from animat.training.lessons import Lesson
 from animat.training.policy import Policy
@@ -357,7 +357,9 @@ def test_where_no_gpu_is_found_it_says_so_in_a_line(
 
 
 def test_a_training_records_its_device_and_is_not_continued_on_another(tmp_path: Path) -> None:
-    on = {name: describe(SHORTEST, timeline_of(), device=name) for name in (None, "NVIDIA H100", "NVIDIA A100")}
+    on = {
+        name: describe_training(SHORTEST, timeline_of(), device=name) for name in (None, "NVIDIA H100", "NVIDIA A100")
+    }
     assert len({manifest["fingerprint"] for manifest in on.values()}) == 3
     assert "device" not in on[None]["versions"]
     (tmp_path / "training.json").write_text(json.dumps(on["NVIDIA H100"]))

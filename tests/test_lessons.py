@@ -27,7 +27,7 @@ from animat.neurons.timeline import SimulatorTimeline
 from animat.robots import ROBOTS, Cartpole, SwingUp, robot_named
 from animat.robots.base import Quantity, Robot
 from animat.training.course import Course, assess, programs_with_ranges, rows_of
-from animat.training.folder import describe, expect_trainable
+from animat.training.folder import describe_training, expect_trainable
 from animat.training.group import Group
 from animat.training.lessons import Lesson, check_lessons, read_lessons
 from animat.training.networks import Layer
@@ -370,9 +370,11 @@ def test_assessments_alone_change_nothing_of_what_is_learned(tmp_path: Path) -> 
 
 
 def test_trainings_with_other_lessons_or_assessments_have_other_fingerprints() -> None:
-    plain = describe(SHORT, timeline_of())
+    plain = describe_training(SHORT, timeline_of())
     others = [replace(SHORT, assess=4), TAUGHT, replace(SHORT, shadowing="drawn")]
-    assert len({plain["fingerprint"], *(describe(other, timeline_of())["fingerprint"] for other in others)}) == 4
+    assert (
+        len({plain["fingerprint"], *(describe_training(other, timeline_of())["fingerprint"] for other in others)}) == 4
+    )
 
 
 def test_recordings_are_drawn_of_those_that_shadowing_would_have_used(tmp_path: Path) -> None:

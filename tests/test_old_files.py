@@ -20,7 +20,7 @@ from animat.responses.extraction import extract_series
 from animat.stimulation.protocol import Protocol
 from animat.studies.run import plan_study, run_study
 from animat.studies.toml import read_study
-from animat.training.folder import check_claim, describe, expect_folder_for
+from animat.training.folder import check_claim, describe_training, expect_folder_for
 from animat.training.policy import Policy
 from animat.training.specification import Training
 from test_studies import Halts
@@ -155,7 +155,7 @@ def test_a_trainings_folder_is_left_to_the_version_that_began_it(old: Path) -> N
     with pytest.raises(Mismatch, match=r"^[^\n]* got one of another .*; give another folder"):
         expect_folder_for(training, old / "policies")
     with pytest.raises(Mismatch, match=r"^[^\n]* got one of another .*; give another folder"):
-        check_claim(old / "policies", describe(training, None))
+        check_claim(old / "policies", describe_training(training, None))
 
 
 def test_a_protocol_of_presentations_is_one_of_trials() -> None:

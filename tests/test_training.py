@@ -25,7 +25,7 @@ from animat.folders import first_difference
 from animat.neurons.timeline import SimulatorTimeline, fit_timeline
 from animat.progress import Progress, Silent
 from animat.robots import Cartpole, Navigation
-from animat.training.folder import describe, missing_policies
+from animat.training.folder import describe_training, missing_policies
 from animat.training.group import Group, programs, split_groups, train_groups
 from animat.training.policy import Policy
 from animat.training.settings import MOST_POLICIES, SAC
@@ -251,7 +251,7 @@ def test_a_second_training_in_a_folder_at_work_is_refused(tmp_path: Path) -> Non
 
 def test_a_checkpoint_of_another_training_or_a_damaged_one_is_refused(tmp_path: Path) -> None:
     timeline = timeline_of()
-    group = Group(SHORT, (0,), timeline, describe(SHORT, timeline)["fingerprint"], {})
+    group = Group(SHORT, (0,), timeline, describe_training(SHORT, timeline)["fingerprint"], {})
     checkpoint = tmp_path / "c.npz"
 
     class Stop(Exception):
@@ -414,7 +414,7 @@ def test_a_number_is_the_same_training_whatever_kind_of_number_it_is() -> None:
         duration_min=60,
         pulse_cost=np.float32(0),
     )
-    assert describe(other, None) == describe(plain, None)
+    assert describe_training(other, None) == describe_training(plain, None)
 
 
 def test_neurons_and_mapping_come_together(tmp_path: Path) -> None:
@@ -509,8 +509,8 @@ def test_what_conditions_deliver_decides_the_fingerprint() -> None:
     timeline = timeline_of()
     conditions = tuple(replace(each, electrodes=((7 + i,),)) for i, each in enumerate(timeline.conditions))
     others = replace(timeline, conditions=conditions)
-    first, second = (describe(SHORT, each) for each in (timeline, others))
-    assert first["fingerprint"] != second["fingerprint"] == describe(SHORT, replace(others))["fingerprint"]
+    first, second = (describe_training(SHORT, each) for each in (timeline, others))
+    assert first["fingerprint"] != second["fingerprint"] == describe_training(SHORT, replace(others))["fingerprint"]
     assert "electrodes" in str(first_difference(first, second, ignoring=("fingerprint",)))
 
 

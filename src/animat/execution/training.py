@@ -27,7 +27,7 @@ from animat.training.course import rows_of
 from animat.training.folder import (
     MANIFEST,
     check_claim,
-    describe,
+    describe_training,
     expect_trainable,
     finish,
     groups_of,
@@ -95,7 +95,7 @@ def train(
     on_cores = folder is None or executor is not None or isinstance(training.robot, HostRobot)
     gpu = None if on_cores else find_gpu()
     device = gpu_here() if folder is None else gpu
-    manifest = describe(training, timeline, sources, random_return, device=device)
+    manifest = describe_training(training, timeline, sources, random_return, device=device)
     groups = groups_of(training, timeline, manifest, fewest=2)
     if folder is None:
         return _train_in_memory(groups, _phase_of(groups, progress), callbacks)

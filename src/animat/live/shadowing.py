@@ -31,7 +31,7 @@ from animat.recordings.formats.nwb import recording_name, write_nwb
 from animat.responses.extraction import extract_series
 from animat.responses.responses import Responses
 from animat.stimulation.protocol import Protocol
-from animat.training.folder import describe, groups_of
+from animat.training.folder import describe_training, groups_of
 from animat.training.policy import Policy
 from animat.training.specification import Training
 from animat.writing import exclusive_lock, expect_writable
@@ -189,7 +189,7 @@ class _Run:
         """Record and train to the end; returns the policies."""
         timeline = self._record(0, in_phase(progress, "recording"))
         assert timeline is not None
-        groups = groups_of(self.training, timeline, describe(self.training, timeline))
+        groups = groups_of(self.training, timeline, describe_training(self.training, timeline))
         minutes, policies = self.timetable.duration_min, self.folder / POLICIES
         progress = in_phase(progress, "training", minutes, "min of the culture")
         with Trainers(groups, self.folder / _EXCHANGE, policies) as trainers:

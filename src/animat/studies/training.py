@@ -14,7 +14,7 @@ from animat.progress import Progress
 from animat.studies.folder import TIMELINE, policies_folder
 from animat.studies.specification import Arm, RobotSpec, Study
 from animat.studies.task import StudyTask, study_seed
-from animat.training.folder import describe, provenance_of
+from animat.training.folder import describe_training, provenance_of
 from animat.training.group import Group, SideBySide
 from animat.training.settings import SAC
 from animat.training.specification import Training
@@ -49,7 +49,7 @@ def work_on(
     training: Training, members: tuple[int, ...], timeline: SimulatorTimeline | None, place: Path, checkpoint: Path
 ) -> TrainingWork:
     """The work of training some policies, with a description for the policies' folder."""
-    manifest = describe(training, timeline, device=gpu_here())
+    manifest = describe_training(training, timeline, device=gpu_here())
     group = Group(training, members, timeline, manifest["fingerprint"], provenance_of(manifest))
     return TrainingWork(group, place, checkpoint, description=manifest)
 

@@ -66,7 +66,7 @@ def expect_trainable(training: Training, *, is_saved: bool) -> None:
             MAPPINGS.expect_loadable(mapping, in_workers=True)
 
 
-def describe(
+def describe_training(
     training: Training,
     timeline: SimulatorTimeline | None,
     sources: Sequence[str] = (),
@@ -130,7 +130,7 @@ def expect_folder_for(training: Training, folder: Path) -> None:
     if (stored := _stored_description(folder)) is not None:
         as_long_as_recordings = training.duration_min is None and training.mapping is not None
         unknown = ("simulators", *_NOT_REPORTED, "device", *["duration_min"] * as_long_as_recordings)
-        if difference := first_difference(stored, describe(training, None), ignoring=unknown, first=_FIRST):
+        if difference := first_difference(stored, describe_training(training, None), ignoring=unknown, first=_FIRST):
             raise folder_mismatch(folder, "training", difference)
 
 
