@@ -31,7 +31,7 @@ _REPORTED_BYTES = 2**16
 
 
 @dataclass(frozen=True)
-class Answer:
+class CallResult:
     """The outcome of a call: its value, the exception it raised, or how its process ended; and its duration."""
 
     value: Any = None
@@ -47,7 +47,7 @@ class _Core:
         self._number, self._client = number, ""
         self._processes = PinnedProcesses([number])
 
-    def work(self, call: bytes, client: str, worker: Any, key: object) -> Answer:
+    def work(self, call: bytes, client: str, worker: Any, key: object) -> CallResult:
         if client != self._client:
             self._renew()
             self._client = client
@@ -59,11 +59,11 @@ class _Core:
                 raise AnimatError("nobody is waiting for it any more")
         took_s = time.monotonic() - began_s
         try:
-            return Answer(future.result(), took_s=took_s)
+            return CallResult(future.result(), took_s=took_s)
         except BrokenExecutor as error:
-            return Answer(ended=f"{error}, on {platform.node()}", took_s=took_s)
+            return CallResult(ended=f"{error}, on {platform.node()}", took_s=took_s)
         except Exception as error:
-            return Answer(error=error, took_s=took_s)
+            return CallResult(error=error, took_s=took_s)
 
     def _renew(self) -> None:
         self._processes.kill_workers()

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, final
 
 from animat.errors import AnimatError
-from animat.execution.dask_worker import PLACE_PREFIX, Answer, topic_of, work
+from animat.execution.dask_worker import PLACE_PREFIX, CallResult, topic_of, work
 
 ATTEMPTS = 3
 """How often a call may fail, or its process end, before this is reported."""
@@ -295,7 +295,7 @@ class Dispatch:
             if not call.future.done():
                 self._waiting.appendleft(call)
 
-    def _answer(self, call: Call, answer: Answer) -> None:
+    def _answer(self, call: Call, answer: CallResult) -> None:
         """Set a call's result, unless it is to be tried again."""
         if call.cost_s is not None:
             self._expected_s += call.cost_s
