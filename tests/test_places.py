@@ -17,7 +17,7 @@ from animat.cultures.series import Series
 from animat.errors import InvalidArgument, InvalidFile
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.reading import read_recording
-from animat.responses.condition import Condition, abbreviated, listed
+from animat.responses.condition import Condition, abbreviated, electrodes_label
 from animat.responses.conditions import ByElectrode, conditions_named
 from animat.responses.extraction import extract_responses
 from animat.responses.inspection import inspect_recording
@@ -199,10 +199,12 @@ def test_corners_are_recorded_at_one_frequency() -> None:
 
 def test_large_sets_of_electrodes_are_counted_in_labels() -> None:
     small, large, other = (1, 2), (1, 2, 3, 4, 5, 6), (1, 2, 3, 4, 5, 7)
-    written = [Condition(f"5 Hz, {listed(one)}", float(i), electrodes=(one,)) for i, one in enumerate((small, large))]
+    written = [
+        Condition(f"5 Hz, {electrodes_label(one)}", float(i), electrodes=(one,)) for i, one in enumerate((small, large))
+    ]
     assert [one.label for one in abbreviated(written)] == ["5 Hz, electrodes 1+2", "5 Hz, 6 electrodes from 1"]
     assert abbreviated(abbreviated(written)) == abbreviated(written)
-    alike = [*written, Condition(listed(other), 2.0, electrodes=(other,))]
+    alike = [*written, Condition(electrodes_label(other), 2.0, electrodes=(other,))]
     assert abbreviated(alike) == tuple(alike)
 
 

@@ -19,7 +19,7 @@ from animat.evaluation.statistics import compare
 from animat.neurons.fidelity import Fidelity
 from animat.recordings.findings import Finding
 from animat.report.html import Picture, Section, Table, with_links, with_minus, write_page
-from animat.report.over_time import Courses, LearningCurve, draw_learning_curves, draw_over_time, over_rounds
+from animat.report.over_time import Courses, LearningCurve, draw_learning_curves, draw_returns_over_time, over_rounds
 from animat.report.results import ComparedReturns, ControlReturns, OverCultures, Results, Score, StudyOptimum
 from animat.report.returns import Pair, draw_comparisons, draw_controls, draw_headline
 from animat.report.style import save_figure
@@ -663,7 +663,7 @@ def test_optima_over_time_are_labelled_coarse_and_missing_arms_are_counted() -> 
         Courses("1-threshold", minutes, returns, np.zeros(2), np.ones(2), {0.0: 1.1}),
         Courses("linear", minutes, {"linear": np.zeros((2, 2))}, np.zeros(2), np.full(2, np.nan)),
     ]
-    figure = draw_over_time(panels, "cartpole", trained_until_min=5.0)
+    figure = draw_returns_over_time(panels, "cartpole", trained_until_min=5.0)
     said = legend(figure)
     assert {
         "optimal return, coarse grid",
@@ -686,7 +686,7 @@ def test_the_legend_of_a_single_panel_is_whole() -> None:
     names = ("before training", "without shadowing", "1 threshold")
     returns = {name: np.ones((4, 2)) for name in names}
     panel = Courses("1-threshold", minutes, returns, minutes, minutes, {0.0: 1.0})
-    figure = draw_over_time([panel], "cartpole", trained_until_min=5.0)
+    figure = draw_returns_over_time([panel], "cartpole", trained_until_min=5.0)
     figure.canvas.draw()
     within = figure.legends[0].get_window_extent()
     assert within.x0 >= 0 and within.x1 <= figure.bbox.width

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from animat.report.over_time import Courses, LearningCurve, draw_learning_curves, draw_over_time
+from animat.report.over_time import Courses, LearningCurve, draw_learning_curves, draw_returns_over_time
 from animat.report.results import ControlReturns, OverCultures
 from animat.report.returns import Pair, draw_comparisons, draw_controls, draw_headline, draw_over_cultures
 from animat.studies.publishing import _describe
@@ -79,7 +79,7 @@ def long_named(kind: str) -> Figure:
         name = "my_laboratory.another_package.mappings:Steep, percentiles fixed"
         returns = {each: np.ones((3, 2)) for each in LONG}
         courses = [Courses(f"{name} {i}", minutes, returns, minutes, np.full(2, np.nan)) for i in (1, 2)]
-        return draw_over_time(courses, f"{ON[0]}: at every recording", trained_until_min=5.0)
+        return draw_returns_over_time(courses, f"{ON[0]}: at every recording", trained_until_min=5.0)
     if kind == "over cultures":
         row = OverCultures(LONG[0], ON[0], 2, 1.0, 1.2, 0.2, 0.1, 0.3, 2, 2, 2)
         over = [replace(row, comparison=name, robot=robot) for name in LONG for robot in ON]

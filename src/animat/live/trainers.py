@@ -47,7 +47,7 @@ class Exchange:
         read: tuple[int, float, NeuronSimulator] = pickle.loads((self.folder / f"{newest:06}.simulator").read_bytes())
         return read
 
-    def report_of(self, group: Group) -> Path:
+    def report_file(self, group: Group) -> Path:
         """The file of the last report on a group's training (`animat.execution.task.report`)."""
         return self.folder / f"p{group.members[0]}.json"
 
@@ -74,7 +74,7 @@ class TrainAlongside(Task):
         return {"algorithm": self.group.training.algorithm}
 
     def run(self, folder: Path, progress: Progress) -> list[Path]:
-        training, reports = self.group.training, self.exchange.report_of(self.group)
+        training, reports = self.group.training, self.exchange.report_file(self.group)
         training.register()
         swaps: list[dict[str, Any]] = []
         # The policies' provenance lists their swaps, which are added below.
@@ -155,7 +155,7 @@ class Trainers:
                 raise AnimatError(f"training {names}: {error} meanwhile; the recordings are kept") from error
         swaps: list[dict[str, Any]] = []
         for group in self._groups:
-            if (latest := reported(self._exchange.report_of(group))) is not None:
+            if (latest := reported(self._exchange.report_file(group))) is not None:
                 known = len(self._reports[group]["swaps"]) if group in self._reports else 0
                 swaps += [{"members": list(group.members), **swap} for swap in latest["swaps"][known:]]
                 self._reports[group] = latest

@@ -125,7 +125,7 @@ class Courses:
         return np.asarray(np.quantile(self.returns[arm], [0.25, 0.5, 0.75], axis=0), np.float64)
 
 
-def draw_over_time(panels_of: Sequence[Courses], title: str, *, trained_until_min: float) -> Figure:
+def draw_returns_over_time(panels_of: Sequence[Courses], title: str, *, trained_until_min: float) -> Figure:
     """One panel per mapping: median and quartiles over policies of each of its first arms; training's end is marked."""
     figure, panels = grid_of_panels(len(panels_of), 2, _WIDE_IN, 3.4, title, share_x=True)
     names = list(dict.fromkeys(name for of in panels_of for name in list(of.returns)[:_MOST_ARMS]))

@@ -70,7 +70,7 @@ class Condition:
         return sum(periods_s) / len(periods_s) if periods_s else math.nan
 
 
-def listed(electrodes: Sequence[int]) -> str:
+def electrodes_label(electrodes: Sequence[int]) -> str:
     """The label of a set of electrodes: `"electrodes 909+23923"`; `"no electrode"` if nothing is delivered."""
     if (tuple(electrodes),) == RESTING:
         return "no electrode"
@@ -85,7 +85,7 @@ def brief_labels(sets: Collection[Sequence[int]]) -> list[str]:
     counted = {tuple(one): f"{len(one)} electrodes from {one[0]}" for one in sets if len(one) > _MOST_LISTED}
     if len(set(counted.values())) < len(counted):
         counted = {}
-    return [counted.get(tuple(one)) or listed(one) for one in sets]
+    return [counted.get(tuple(one)) or electrodes_label(one) for one in sets]
 
 
 def abbreviated(conditions: Sequence[Condition]) -> tuple[Condition, ...]:
@@ -93,7 +93,7 @@ def abbreviated(conditions: Sequence[Condition]) -> tuple[Condition, ...]:
     sets = {one.electrodes[0] for one in conditions if one.electrodes is not None and len(one.electrodes) == 1}
     brief = dict(zip(sets, brief_labels(sets), strict=True))
     return tuple(
-        replace(one, label=one.label.replace(listed(one.electrodes[0]), brief[one.electrodes[0]]))
+        replace(one, label=one.label.replace(electrodes_label(one.electrodes[0]), brief[one.electrodes[0]]))
         if one.electrodes and one.electrodes[0] in brief
         else one
         for one in conditions

@@ -63,15 +63,15 @@ def arms_table(study: Study) -> Table:
 def _describe(arm: Arm) -> Iterator[str]:
     if not arm.trained:
         yield "New networks, as they are before training."
-    yield begin(describe_mapping(arm))
+    yield capitalised(describe_mapping(arm))
     if arm.through_neurons and arm.trained:
         yield _SHADOWING[arm.shadowing]
     if arm.delivery == "shuffled":
-        yield f"{begin(_SHUFFLED[:-1])}, in training and in evaluation."
+        yield f"{capitalised(_SHUFFLED[:-1])}, in training and in evaluation."
     if arm.percentiles == "first":
-        yield begin(_FIXED)
+        yield capitalised(_FIXED)
 
 
-def begin(text: str) -> str:
+def capitalised(text: str) -> str:
     """The text with a capital at its beginning; names in it keep their own."""
     return text[:1].upper() + text[1:]

@@ -39,7 +39,7 @@ from animat.studies.folder import MANIFEST, RECEIPTS, claim_folder
 from animat.studies.results import write_records
 from animat.studies.run import run_jobs
 from animat.studies.specification import Episodes, Resolution
-from animat.studies.task import draw_seed
+from animat.studies.task import derived_seed
 from animat.studies.training import work_on
 from animat.training.folder import versions_of
 from animat.training.policy import load_policies
@@ -140,7 +140,7 @@ class RobotTask(ContextTask):
 
     def seed_for(self, purpose: str) -> int:
         """A seed for each culture and robot; otherwise sessions of all would begin at the same few starts."""
-        return draw_seed(purpose, self.study.seed, self.robot, str(self.culture))
+        return derived_seed(purpose, self.study.seed, self.robot, str(self.culture))
 
     def path(self, folder: Path, name: str) -> Path:
         """A file or folder of this robot on this culture."""

@@ -29,7 +29,7 @@ from animat.report.html import Columns, Section, cell, columns_of, picture_of, t
 from animat.report.results import ComparedReturns, OverCultures, Results, Score
 from animat.report.returns import draw_over_cultures
 from animat.report.style import save_formats
-from animat.studies.arms import arm_differences, arms_table, begin, summarise_arms
+from animat.studies.arms import arm_differences, arms_table, capitalised, summarise_arms
 from animat.studies.folder import MANIFEST as STUDY
 from animat.studies.folder import REPORT, RESULTS, expect_same_specification
 from animat.studies.outperforming import not_outperforming_over
@@ -218,7 +218,7 @@ def write_cultures_page(study: Study, found: CulturesRun) -> Path:
         save_formats(figure, found.folder, "over-cultures")
         sections.append(_summary(study, found))
     if found.not_outperforming:
-        sentences = tuple(f"{begin(sentence)}." for sentence in found.not_outperforming)
+        sentences = tuple(f"{capitalised(sentence)}." for sentence in found.not_outperforming)
         sections.append(Section("Against the heuristic policy", sentences))
     pages = {name: f"{name}/{REPORT}" for name in found.finished}
     warned = {name: f", {counted(len(each), 'warning')}" if each else "" for name, each in found.warnings.items()}

@@ -23,7 +23,7 @@ from animat.records import read_record
 from animat.report.array import draw_array, rates_of_sites
 from animat.report.drift import PERCENTILES, draw_drift, drift_of
 from animat.report.episodes import draw_frames, draw_paths
-from animat.report.over_time import Courses, LearningCurve, draw_learning_curves, draw_over_time, over_rounds
+from animat.report.over_time import Courses, LearningCurve, draw_learning_curves, draw_returns_over_time, over_rounds
 from animat.report.response_histograms import draw_burst_separation, draw_response_histograms, draw_responses_over_time
 from animat.report.results import ComparedReturns, ControlReturns, Results
 from animat.report.returns import Pair, draw_comparisons, draw_controls
@@ -109,7 +109,9 @@ class RobotPictures(StudyTask):
         if timeline is not None and len(timeline) > 1:
             courses = list(_courses(known, coarse, timeline))
             until_min = float(timeline.start_min[0]) + study.training_min
-            figures["over-time"] = draw_over_time(courses, f"{name}: at every recording", trained_until_min=until_min)
+            figures["over-time"] = draw_returns_over_time(
+                courses, f"{name}: at every recording", trained_until_min=until_min
+            )
             tables["over-time"] = courses_rows(courses)
         progress.update(0.2, 1, "controls")
         controls = _controls(row for row in results.controls if row.robot == name)

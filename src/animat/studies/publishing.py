@@ -19,7 +19,7 @@ from animat.report.returns import draw_headline
 from animat.report.style import save_figure, save_formats
 from animat.responses.responses import Responses
 from animat.studies import report_tables
-from animat.studies.arms import arm_differences, arms_table, begin, describe_mapping, summarise_arms
+from animat.studies.arms import arm_differences, arms_table, capitalised, describe_mapping, summarise_arms
 from animat.studies.captions import BURSTS, CULTURE, HEADLINE, NO_BURSTS, ROBOT, Caption
 from animat.studies.differences import decisions, differing_comparisons, too_few_policies
 from animat.studies.folder import MANIFEST, REPORT, RESULTS, TIMELINE
@@ -55,7 +55,7 @@ class Publish(StudyTask):
         sections = [_summary(study, results, [row for row, _ in headline], picture)]
         for spec in study.robots:
             pictures = _pictures(folder, spec.name, ROBOT, {**_facts_of(study), "round": f"{round_of(study, spec):,}"})
-            sections.append(Section(begin(spec.name), pictures=pictures))
+            sections.append(Section(capitalised(spec.name), pictures=pictures))
         if kept:
             tables = (report_tables.controllability_table(study, folder, kept),)
             pictures = _pictures(folder, "culture", CULTURE, _facts_of_culture(series))
@@ -76,7 +76,7 @@ def _lead(study: Study) -> str:
     neurons = {"virtual": "through a virtual culture", "files": "through recordings"}[study.culture.kind]
     driven = neurons if study.needs_neurons else "without neurons"
     trained = _and([f"{spec.trained_for:,} iterations on {spec.name}" for spec in study.robots])
-    return f"{begin(robots)}, driven {driven}. {summarise_arms(study)}, trained for {trained}."
+    return f"{capitalised(robots)}, driven {driven}. {summarise_arms(study)}, trained for {trained}."
 
 
 def _colophon(study: Study, manifest: Mapping[str, Any]) -> list[str]:
@@ -115,7 +115,7 @@ def _summary(study: Study, results: Results, headline: Sequence[Score], picture:
         if best is not None:
             at_random = _at_random(spec.name, study.arm(best.arm), results.controls)
             mapping = f"In “{best.arm}” {describe_mapping(study.arm(best.arm))}"
-            text = f"{begin(spec.name)}: {_describe(best)}{at_random}"
+            text = f"{capitalised(spec.name)}: {_describe(best)}{at_random}"
             sentences.append(text if mapping in explained else f"{text} {mapping}")
             explained.append(mapping)
     rows = results.comparisons
@@ -238,7 +238,7 @@ def _pictures(folder: Path, of: str, captions: Mapping[str, Caption], facts: Map
     for name, (title, caption, numbers) in captions.items():
         file, files = f"figures/{of}-{name}", (each.format(of=of) for each in numbers)
         if (folder / f"{file}.png").exists():
-            pictures.append(picture_of(folder, file, f"{begin(of)}: {title}", caption.format(**facts), *files))
+            pictures.append(picture_of(folder, file, f"{capitalised(of)}: {title}", caption.format(**facts), *files))
     return tuple(pictures)
 
 
@@ -260,7 +260,7 @@ def _controls(study: Study, results: Results) -> Section:
     )
     comparisons = report_tables.heuristic_table(results), report_tables.reflexes_table(results)
     sentences = [*(f"{each}." for each in not_outperforming(results)), *describe_reflexes(results.reflexes)]
-    paragraphs = ("Each control removes something.", *map(begin, sentences))
+    paragraphs = ("Each control removes something.", *map(capitalised, sentences))
     tables = (*(table for table in comparisons if table.rows), report_tables.controls_table(study, results))
     return Section("Is it the culture?", paragraphs, points, tables)
 

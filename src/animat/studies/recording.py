@@ -80,7 +80,7 @@ class FitSimulators(StudyTask):
 
     def make(self, folder: Path, progress: Progress) -> list[Path]:
         study, series = self.study, read_series(self.study, folder)
-        timeline = fit_simulators(study, series)
+        timeline = fit_study_timeline(study, series)
         noticed = [*timeline.findings, *_moved_comparisons(study, timeline.start_min.tolist())]
         presentation = timeline.presentation
         # Recordings in blocks, as the paper's, cannot be simulated with memory.
@@ -91,7 +91,7 @@ class FitSimulators(StudyTask):
         return [save_timeline(timeline, folder / TIMELINE), _write_responses(folder / RESPONSES, series)]
 
 
-def fit_simulators(study: Study, series: list[Responses]) -> SimulatorTimeline:
+def fit_study_timeline(study: Study, series: list[Responses]) -> SimulatorTimeline:
     """Fit simulators to responses with a study's settings; UnusableData for only one condition, unless allowed."""
     settings = study.simulators
     timeline = fit_timeline(series, kind=settings.kind, bins=settings.bins, range_hz=settings.range_hz)

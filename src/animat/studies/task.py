@@ -14,14 +14,14 @@ from animat.progress import Progress
 from animat.studies.specification import Study
 
 
-def draw_seed(*names: object) -> int:
+def derived_seed(*names: object) -> int:
     """A seed derived from the names of what is drawn."""
     return int.from_bytes(hashlib.sha256(repr(names).encode()).digest()[:4], "big") >> 1
 
 
 def study_seed(study: Study, *names: object) -> int:
     """A seed for what a study draws; none share random numbers, as tests take arms and cultures for independent."""
-    return draw_seed(study.seed, study.culture.name, *names)
+    return derived_seed(study.seed, study.culture.name, *names)
 
 
 @dataclass(frozen=True)

@@ -39,10 +39,10 @@ def read_study(path: str | os.PathLike[str]) -> Study:
     its default; an unknown key is refused. Lists in robots, arms and comparisons stand for all combinations.
     Raises InvalidFile, naming the file, the key, what was expected and what came.
     """
-    return study_from(read_toml(path), path)
+    return study_from(read_specification(path), path)
 
 
-def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
+def read_specification(path: str | os.PathLike[str]) -> dict[str, Any]:
     """A specification's file as plain data; raises InvalidFile if it cannot be read, is not TOML or is empty."""
     data = plain_file.read_toml(path, MOST_BYTES)
     if not data:

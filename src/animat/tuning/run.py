@@ -23,7 +23,7 @@ from animat.progress import Part, Progress, Silent
 from animat.studies.folder import OWN_FOLDERS, RECEIPTS, claim_folder, describe_study, hash_sources
 from animat.studies.recording import JOB, MakeRecordings
 from animat.studies.run import ITERATIONS_PER_S, check_custom
-from animat.studies.task import draw_seed
+from animat.studies.task import derived_seed
 from animat.training.group import split_groups
 from animat.training.specification import CHUNKS
 from animat.tuning.results import Final, TuningResult, write_results
@@ -127,7 +127,7 @@ class _Run:
     def _run_batch(self, trials: Sequence[Trial], place: str) -> list[Trial]:
         """Successive halving: all trials up to the first rung, the best of them up to the next, and so on."""
         tune, study = self._tuning.tune, self._tuning.study
-        seeds = draw_seed("tuning", tune.seed, "training"), draw_seed("tuning", tune.seed, "episodes")
+        seeds = derived_seed("tuning", tune.seed, "training"), derived_seed("tuning", tune.seed, "episodes")
         members, rungs = tuple(range(tune.policies)), tune.chunks
         results = {trial.trial: trial for trial in trials}
         for rung, (first, last) in enumerate(zip([0, *rungs], rungs, strict=False)):
@@ -166,7 +166,7 @@ class _Run:
         ranked = sorted(complete, key=lambda result: (-result.means[-1], result.trial))
         others = [result for result in ranked if result.trial >= self._first][: tune.finalists]
         finalists = [*results[: self._first], *others]
-        seeds = draw_seed("tuning", tune.seed, "final training"), draw_seed("tuning", tune.seed, "final episodes")
+        seeds = derived_seed("tuning", tune.seed, "final training"), derived_seed("tuning", tune.seed, "final episodes")
         split = split_groups(study.policies)
         tasks = {}
         for trial, members in product(finalists, split):

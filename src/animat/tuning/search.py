@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from animat.errors import InvalidFile
 from animat.extras import expect_extra
 from animat.records import Number, read_record
-from animat.studies.task import draw_seed
+from animat.studies.task import derived_seed
 from animat.training.settings import SAC
 from animat.tuning.specification import Range, Settings, Space, Tuning, Value, first_settings
 from animat.writing import write_whole
@@ -83,7 +83,7 @@ class Search:
         optuna = expect_optuna()
         optuna.logging.set_verbosity(optuna.logging.ERROR)
         sampler = optuna.samplers.TPESampler(
-            seed=draw_seed("search", tuning.tune.seed), n_startup_trials=tuning.tune.together, constant_liar=True
+            seed=derived_seed("search", tuning.tune.seed), n_startup_trials=tuning.tune.together, constant_liar=True
         )
         self._optuna = optuna
         self._study = optuna.create_study(direction="maximize", sampler=sampler)

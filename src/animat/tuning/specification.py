@@ -14,7 +14,7 @@ from animat.errors import InvalidArgument, InvalidFile, did_you_mean, in_file, s
 from animat.records import Flag, Number, Seed, Whole, read_record, record
 from animat.robots.host import HostRobot
 from animat.studies.specification import Episodes, Study
-from animat.studies.toml import read_toml, study_from
+from animat.studies.toml import read_specification, study_from
 from animat.training.settings import SAC
 from animat.training.specification import CHUNKS
 
@@ -252,7 +252,7 @@ def tuning_of(study: Study, tune: Tune) -> Tuning:
 
 def read_tuning(path: str | os.PathLike[str]) -> Tuning:
     """Read a study's file with a table `[tune]`; errors as in `animat.studies.toml.read_study`."""
-    data = read_toml(path)
+    data = read_specification(path)
     tune = data.pop("tune", {})
     if not data:
         raise InvalidFile(f"{path}: expected a study's settings in addition to [tune], such as [[robots]], got none")

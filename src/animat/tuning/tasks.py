@@ -22,7 +22,7 @@ from animat.evaluation.rollouts import Networks, roll_out
 from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import SimulatorTimeline, load_timeline, save_timeline
 from animat.progress import Progress
-from animat.studies.recording import fit_simulators, read_series
+from animat.studies.recording import fit_study_timeline, read_series
 from animat.studies.specification import Study
 from animat.studies.task import StudyTask
 from animat.studies.training import training_of
@@ -51,7 +51,7 @@ class FitVariant(StudyTask):
     sizes = ("culture.sessions", "culture.trials", "simulators.bins")
 
     def make(self, folder: Path, progress: Progress) -> list[Path]:
-        timeline = fit_simulators(self.study, read_series(self.study, folder))
+        timeline = fit_study_timeline(self.study, read_series(self.study, folder))
         return [save_timeline(timeline, folder / timeline_file(self.study))]
 
 
