@@ -13,7 +13,7 @@ from animat.errors import InvalidArgument
 from animat.lazy import Array, Axes, jax, jnp
 from animat.records import record
 from animat.robots.base import Amount, Iterations, Quantity, Robot, Size, Transition, Uniforms
-from animat.robots.drawing import ACCENT, BODY, GOAL, GOAL_FILL, INK, TRAIL, Canvas, Picture, draw_over_time
+from animat.robots.drawing import ACCENT, BODY, GOAL, GOAL_FILL, INK, TRAIL, Canvas, Pixels, draw_over_time
 from animat.robots.motion import cost_of_distance, runge_kutta
 from animat.robots.registry import register_robot
 
@@ -186,7 +186,7 @@ class TwoLinkArm(Robot[ArmState]):
 
     def draw(
         self, observation: np.ndarray, command: np.ndarray, earlier: Sequence[np.ndarray], height_px: int
-    ) -> Picture:
+    ) -> Pixels:
         """The links, the target and the path of the tip, seen from above (see `animat.robots.drawing`)."""
         arm_m = self.upper_length_m + self.lower_length_m
         half_m = 1.1 * arm_m

@@ -13,7 +13,7 @@ from animat.errors import InvalidArgument
 from animat.lazy import Array, Axes, jnp
 from animat.records import Number, record
 from animat.robots.base import Amount, Iterations, Quantity, Robot, Size, Transition, Uniforms
-from animat.robots.drawing import ACCENT, BODY, INK, PAPER, RAIL, Canvas, Picture, draw_over_time, fit
+from animat.robots.drawing import ACCENT, BODY, INK, PAPER, RAIL, Canvas, Pixels, draw_over_time, fit
 from animat.robots.grid import Axis, Grid
 from animat.robots.registry import register_robot
 
@@ -205,7 +205,7 @@ class Cartpole(Robot[CartpoleState]):
             noise_in_command=self.force_noise,
         )
 
-    def draw(self, observation: np.ndarray, command: float, earlier: Sequence[np.ndarray], height_px: int) -> Picture:
+    def draw(self, observation: np.ndarray, command: float, earlier: Sequence[np.ndarray], height_px: int) -> Pixels:
         """The cart on its track with the pole, and the command as an arrow (see `animat.robots.drawing`)."""
         half_track, pole = self.track_length_m / 2, self.pole_length_m
         margin = 0.25 * pole

@@ -15,7 +15,7 @@ from animat.robots.base import Robot, capability
 
 Colour = tuple[int, int, int]
 Point = tuple[float, float]
-Picture = UInt8[np.ndarray, "height width 3"]
+Pixels = UInt8[np.ndarray, "height width 3"]
 
 PAPER: Colour = (250, 250, 248)
 INK: Colour = (52, 58, 64)
@@ -43,7 +43,7 @@ def draw_robot(
     command: float | Float[np.ndarray, " commands"] = 0.0,
     earlier: Sequence[Float[np.ndarray, " observations"]] = (),
     height_px: int = 360,
-) -> Picture:
+) -> Pixels:
     """A picture of a robot as an observation, in its own units, describes it: red, green and blue from 0 to 255.
 
     Args:
@@ -120,7 +120,7 @@ class Canvas:
         if left <= right and top <= bottom:
             self._draw.rounded_rectangle((left, top, right, bottom), max(0.0, corner) * self._scale, colour)
 
-    def picture(self) -> Picture:
+    def picture(self) -> Pixels:
         """The picture so far."""
         return np.array(self._image.reduce(_FINER))
 

@@ -14,7 +14,7 @@ from animat.errors import InvalidArgument
 from animat.lazy import Array, Axes, jnp
 from animat.records import Number, record
 from animat.robots.base import Amount, Iterations, Quantity, Robot, Size, Transition, Uniforms
-from animat.robots.drawing import ACCENT, AIM, BODY, EDGE, ENDED, GOAL, GOAL_FILL, INK, TRAIL, Canvas, Picture, fit
+from animat.robots.drawing import ACCENT, AIM, BODY, EDGE, ENDED, GOAL, GOAL_FILL, INK, TRAIL, Canvas, Pixels, fit
 from animat.robots.grid import Axis, Grid
 from animat.robots.motion import cost_of_distance, within_half_a_turn
 from animat.robots.registry import register_robot
@@ -170,7 +170,7 @@ class Navigation(Robot[NavigationState]):
             lambda coordinates: NavigationState(*coordinates),
         )
 
-    def draw(self, observation: np.ndarray, command: float, earlier: Sequence[np.ndarray], height_px: int) -> Picture:
+    def draw(self, observation: np.ndarray, command: float, earlier: Sequence[np.ndarray], height_px: int) -> Pixels:
         """The robot in its arena, with the goal and the robot's path (see `animat.robots.drawing`)."""
         x, y, heading = (float(value) for value in observation)
         width_m, height_m = self.arena_width_m, self.arena_height_m

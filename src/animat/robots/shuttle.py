@@ -13,7 +13,7 @@ from animat.errors import InvalidArgument
 from animat.lazy import Array, Axes, jax, jnp
 from animat.records import Number, record
 from animat.robots.base import Iterations, Quantity, Robot, Size, Transition, Uniforms
-from animat.robots.drawing import ACCENT, BODY, GOAL, GOAL_FILL, INK, RAIL, Canvas, Picture, draw_over_time
+from animat.robots.drawing import ACCENT, BODY, GOAL, GOAL_FILL, INK, RAIL, Canvas, Pixels, draw_over_time
 from animat.robots.grid import TAPS, Axis, Grid
 from animat.robots.registry import register_robot
 
@@ -137,7 +137,7 @@ class Shuttle(Robot[ShuttleState]):
             lambda coordinates: ShuttleState(coordinates[1], coordinates[2], coordinates[0]),
         )
 
-    def draw(self, observation: np.ndarray, command: float, earlier: Sequence[np.ndarray], height_px: int) -> Picture:
+    def draw(self, observation: np.ndarray, command: float, earlier: Sequence[np.ndarray], height_px: int) -> Pixels:
         """The cart on its track, with the cue's place filled and the command as a line under the cart."""
         position, _, cue = (float(value) for value in observation)
         half_m, radius_m = self.track_length_m / 2, self.place_radius_m

@@ -14,7 +14,7 @@ from animat.errors import InvalidArgument
 from animat.lazy import Array, Axes, jnp
 from animat.records import Number, record
 from animat.robots.base import Amount, Iterations, Quantity, Robot, Size, Transition, Uniforms
-from animat.robots.drawing import ACCENT, BODY, GOAL, GOAL_FILL, INK, Canvas, Picture, draw_over_time
+from animat.robots.drawing import ACCENT, BODY, GOAL, GOAL_FILL, INK, Canvas, Pixels, draw_over_time
 from animat.robots.grid import TAPS, Axis, Grid
 from animat.robots.motion import runge_kutta, within_half_a_turn
 from animat.robots.registry import register_robot
@@ -151,7 +151,7 @@ class SwingUp(Robot[SwingUpState]):
             lambda coordinates: SwingUpState(*coordinates[1:]),
         )
 
-    def draw(self, observation: np.ndarray, command: float, earlier: Sequence[np.ndarray], height_px: int) -> Picture:
+    def draw(self, observation: np.ndarray, command: float, earlier: Sequence[np.ndarray], height_px: int) -> Pixels:
         """The rod, the rewarded range, and the command as an arc about the pivot (see `animat.robots.drawing`)."""
         length = self.length_m
         scale = height_px / (2.5 * length)

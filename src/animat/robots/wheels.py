@@ -13,7 +13,7 @@ from animat.errors import InvalidArgument
 from animat.lazy import Array, Axes, jax, jnp
 from animat.records import Number, record
 from animat.robots.base import Iterations, Quantity, Robot, Size, Transition, Uniforms
-from animat.robots.drawing import ACCENT, BODY, GOAL, GOAL_FILL, INK, RAIL, Canvas, Picture, draw_over_time
+from animat.robots.drawing import ACCENT, BODY, GOAL, GOAL_FILL, INK, RAIL, Canvas, Pixels, draw_over_time
 from animat.robots.motion import cost_of_distance, within_half_a_turn
 from animat.robots.registry import register_robot
 from animat.robots.surroundings import MOST_PLACES, Obstacles, Surroundings, Walls, places_within_reach
@@ -175,7 +175,7 @@ class Wheels(Robot[WheelsState]):
 
     def draw(
         self, observation: np.ndarray, command: np.ndarray, earlier: Sequence[np.ndarray], height_px: int
-    ) -> Picture:
+    ) -> Pixels:
         """Sensors, goal and wheels, centred on the robot with its heading upwards, as its position is not observed."""
         body, reach_m = self.body_radius_m, self.body_radius_m + self.sensor_range_m
         half_m = 1.4 * reach_m

@@ -13,7 +13,7 @@ from PIL import Image, ImageDraw, ImageFont
 from animat.closed_loop.runner import HostRunner
 from animat.report.colours import BLUE, ORANGE, RED, condition_colours
 from animat.report.film.scene import Moment, Scene
-from animat.robots.drawing import Picture, draw_robot
+from animat.robots.drawing import Pixels, draw_robot
 from animat.robots.host import HostRobot
 from animat.robots.starts import robot_generator
 
@@ -33,7 +33,7 @@ COMMANDS = (ORANGE, BLUE, RED)
 class Frames:
     """Draws a scene at any time; `picture` gives the robot at a moment, None if it cannot be drawn."""
 
-    def __init__(self, scene: Scene, picture: Callable[[int], Picture | None]) -> None:
+    def __init__(self, scene: Scene, picture: Callable[[int], Pixels | None]) -> None:
         self._scene, self._picture = scene, picture
         self._times_s = np.array([moment.time_s for moment in scene.moments])
         self._colours = dict(zip(scene.conditions, condition_colours(["Hz"] * len(scene.conditions)), strict=True))
@@ -206,7 +206,7 @@ def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
     return ImageFont.load_default(size)
 
 
-def pictures_of(scene: Scene) -> Callable[[int], Picture | None]:
+def pictures_of(scene: Scene) -> Callable[[int], Pixels | None]:
     """A function that draws the robot at each moment, called with rising numbers; it returns None without a picture."""
     if not isinstance(scene.robot, HostRobot) and not hasattr(scene.robot, "draw"):
         return lambda number: None
@@ -214,7 +214,7 @@ def pictures_of(scene: Scene) -> Callable[[int], Picture | None]:
     return lru_cache(1)(_Replay(scene).picture if isinstance(scene.robot, HostRobot) else partial(_draw, scene))
 
 
-def _draw(scene: Scene, number: int) -> Picture | None:
+def _draw(scene: Scene, number: int) -> Pixels | None:
     now = scene.moments[number]
     if not now.observation:
         return None
@@ -233,7 +233,7 @@ class _Replay:
         self._episode: int | None = None
         self._is_same = True
 
-    def picture(self, number: int) -> Picture | None:
+    def picture(self, number: int) -> Pixels | None:
         for moment in self._moments[self._done : number + 1]:
             self._move(moment)
         self._done = number + 1
