@@ -14,7 +14,7 @@ import time
 
 import pytest
 
-from animat.progress import Bar, EqualPhases, Part, Phase, Speed, in_phase
+from animat.progress import Bar, EqualPhases, Part, Speed, WorkPhase, in_phase
 
 SCRIPT = """
 from animat.progress import Bar
@@ -143,7 +143,7 @@ def test_nothing_is_said_about_the_rest_before_there_is_something_to_tell_by(mon
     """A share of a rounding's size made an estimate of 1,647,536,472,192,901 minutes."""
     at_s = 0.0
     monkeypatch.setattr("animat.progress.time.monotonic", lambda: at_s)
-    phase = Phase("study")
+    phase = WorkPhase("study")
     left = []
     for at, share in ((0.0, 0.0), (5.0, 1e-16), (10.0, 2e-16), (20.0, 0.004), (30.0, 0.02), (60.0, 0.04)):
         at_s = at
@@ -161,7 +161,7 @@ def test_nothing_is_said_about_the_rest_before_there_is_something_to_tell_by(mon
 def test_compiling_and_going_on_from_a_checkpoint_are_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
     now_s = 0.0
     monkeypatch.setattr("animat.progress.time.monotonic", lambda: now_s)
-    phase = Phase("training", 1000, "iterations")
+    phase = WorkPhase("training", 1000, "iterations")
     # 20 s of compiling, half of it from the checkpoint, then one in a hundred every two seconds.
     for second in range(81):
         now_s = float(second)

@@ -127,7 +127,7 @@ class Speed:
         return None if self.per_s is None else left / self.per_s
 
 
-class Phase:
+class WorkPhase:
     """One phase of work and its progress."""
 
     def __init__(self, title: str, amount: float = 0.0, unit: str = "") -> None:
@@ -188,7 +188,7 @@ class Bar:
     """
 
     def __init__(self, title: str) -> None:
-        self._phases = [Phase(title)]
+        self._phases = [WorkPhase(title)]
         self._live: Live | None = None
         self._is_over = threading.Event()
         self._printed_s, self._printed = time.monotonic(), [""]
@@ -215,7 +215,7 @@ class Bar:
         """Begin another phase; the current one is done. See `in_phase`."""
         self._phases[-1].end()
         # Phases that reported nothing are not shown.
-        self._phases = [*(phase for phase in self._phases if phase.has_reported), Phase(title, amount, unit)]
+        self._phases = [*(phase for phase in self._phases if phase.has_reported), WorkPhase(title, amount, unit)]
 
     def update(self, done: float, total: float, note: str = "") -> None:
         self._phases[-1].update(done, total, note)
