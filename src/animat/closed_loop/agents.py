@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Float64
 from animat.environment import Animat, Environment
 from animat.errors import InvalidArgument, shown
 from animat.evaluation.controllers import Called, Controller, can_act, sees_neurons
-from animat.evaluation.controls import RANDOM, Control, Delivered
+from animat.evaluation.controls import RANDOM, Control, ControlDelivery
 from animat.evaluation.rollouts import Actor, Constant, Networks, Uniform
 
 
@@ -97,15 +97,15 @@ class Agent:
     name: str
     meaning: str
     controller: Controller | Mapping[str, Controller]
-    delivery: Delivered = "chosen"
+    delivery: ControlDelivery = "chosen"
     calibrates: bool = True
     drawn_from: Float64[np.ndarray, "responses *readouts"] | None = None
     is_turned_round: bool = False
     switch_at: int | None = None
 
     def __post_init__(self) -> None:
-        if self.delivery not in get_args(Delivered):
-            kinds = ", ".join(get_args(Delivered))
+        if self.delivery not in get_args(ControlDelivery):
+            kinds = ", ".join(get_args(ControlDelivery))
             raise InvalidArgument(f"{self.name}: delivery: expected one of {kinds}, got {self.delivery!r}")
         controllers = self.controller.values() if isinstance(self.controller, Mapping) else (self.controller,)
         for controller in controllers:

@@ -24,7 +24,7 @@ from animat.robots.host import HostRobot
 from animat.robots.starts import Starts
 
 OWN = "your own agent"
-Delivered = Literal["chosen", "shuffled", "silent", "yoked"]
+ControlDelivery = Literal["chosen", "shuffled", "silent", "yoked"]
 """What neurons are given; in training (`animat.wrappers.Delivery`) only the first two exist."""
 
 
@@ -46,7 +46,7 @@ class Control:
     name: str
     meaning: str
     actor: Actor | Called
-    delivery: Delivered = "chosen"
+    delivery: ControlDelivery = "chosen"
     is_drawn: bool = False
     is_turned_round: bool = False
     switch_at: int | None = None
