@@ -6,7 +6,7 @@ import statistics
 from typing import Any
 
 import peers
-from animat.columns import align_columns
+from animat.terminal_table import align_columns
 
 
 def print_table(measured: dict[str, Any]) -> None:

@@ -17,7 +17,6 @@ PACKAGE = Path(__file__).parents[1] / "src" / "animat"
 
 GROUND = (
     "arguments",
-    "columns",
     "compilation",
     "ctrl_c",
     "devices",
@@ -31,6 +30,7 @@ GROUND = (
     "records",
     "registry",
     "tables",
+    "terminal_table",
     "writing",
 )
 """What stands under the story and may be used by all of it."""

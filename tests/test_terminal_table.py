@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from animat.columns import align_columns
+from animat.terminal_table import align_columns
 
 
 def test_text_is_aligned_left_and_numbers_right_under_their_headings() -> None:

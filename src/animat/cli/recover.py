@@ -10,7 +10,7 @@ from typing import Any
 from tyro.conf import Positional
 
 from animat.cli.command import Command
-from animat.columns import align_columns
+from animat.terminal_table import align_columns
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 from tyro.conf import Positional
 
 from animat.cli.command import JobOptions, print_warnings
-from animat.columns import align_columns
 from animat.errors import AnimatError, counted
+from animat.terminal_table import align_columns
 
 if TYPE_CHECKING:
     from animat.studies.specification import Study

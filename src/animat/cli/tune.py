@@ -23,7 +23,7 @@ class TuneFile(JobOptions):
     """Folder for all results; the best settings are in its best.toml"""
 
     def run(self) -> dict[str, Any]:
-        from animat.columns import align_columns
+        from animat.terminal_table import align_columns
         from animat.tuning.specification import read_tuning
 
         tuning = read_tuning(self.specification)

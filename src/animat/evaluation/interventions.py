@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from animat.columns import align_columns
 from animat.environment import Animat, Environment, Neurons
 from animat.errors import InvalidArgument
 from animat.evaluation.controls import Control, interventions_of
@@ -18,6 +17,7 @@ from animat.evaluation.statistics import Interval, interval_of_mean
 from animat.progress import Progress, Silent
 from animat.records import as_json
 from animat.tables import briefly
+from animat.terminal_table import align_columns
 from animat.wrappers import unwrapped
 
 AS_THEY_ARE = "as they are"

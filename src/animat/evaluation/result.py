@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from animat.columns import align_columns
 from animat.errors import counted, in_min
 from animat.evaluation import transfer
 from animat.evaluation.controls import EvaluationRow
@@ -17,6 +16,7 @@ from animat.evaluation.statistics import Interval, Verdict, normalised_score
 from animat.goals.tally import MEANS, cells_of, satisfaction_line
 from animat.recordings.findings import Finding
 from animat.tables import briefly
+from animat.terminal_table import align_columns
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,7 +10,6 @@ import numpy as np
 
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.session import Session, describe_left_out, unanswered_message
-from animat.columns import align_columns
 from animat.cultures.budget import Account
 from animat.errors import in_min
 from animat.evaluation.controls import Control
@@ -23,6 +22,7 @@ from animat.reality_gap.row import Returns, Row, Turns, resampled_means
 from animat.recordings.findings import Finding
 from animat.records import as_json, write_json
 from animat.tables import briefly
+from animat.terminal_table import align_columns
 from animat.writing import write_whole
 
 TABLE_FILE = "returns"

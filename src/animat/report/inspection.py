@@ -7,7 +7,6 @@ import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from animat.columns import align_columns
 from animat.errors import InvalidArgument, Mismatch, counted
 from animat.lazy import Figure
 from animat.recordings.findings import Finding
@@ -21,6 +20,7 @@ from animat.responses.bursts import BIN_S, NetworkBursts
 from animat.responses.inspection import Inspection
 from animat.responses.psth import PostStimulusHistogram, post_stimulus_histogram
 from animat.responses.responses import Responses
+from animat.terminal_table import align_columns
 
 _MOST_CONDITIONS = 16
 

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from animat.columns import align_columns
 from animat.lazy import Figure
 from animat.neurons.prediction import LAGS
 from animat.neurons.validation import FREE_RUNS, MARGINAL, PIT_BINS, Band, Validation, pit_shares
 from animat.report.colours import BLACK, BLUE, GREEN, GREY, ORANGE
 from animat.report.style import add_common_legend, new_figure, style_axes
+from animat.terminal_table import align_columns
 
 COLUMNS = """\
 marginal: all conditions pooled; recorded: the held-out responses themselves
