@@ -19,7 +19,7 @@ from animat.cultures.devices.cl1 import CL1_PULSE, CL1Culture
 from animat.cultures.observed import Observed, Spikes
 from animat.cultures.safety import Admitted
 from animat.cultures.series import record_series
-from animat.cultures.shortfalls import shortfalls
+from animat.cultures.shortfalls import shortfall_findings
 from animat.cultures.under_way import UNDER_WAY, PartialRecording
 from animat.cultures.virtual import VirtualCulture
 from animat.errors import DeviceFailed, InvalidFile
@@ -320,7 +320,7 @@ def test_less_than_half_a_millisecond_between_stretches_is_not_reported(
 ) -> None:
     (block,) = make_schedule(MIXED, np.arange(20)[:, None], 1).blocks
     observed = Observed(0.0, block.duration_s, Spikes(np.empty(0), np.empty(0, np.int64)), block.stimuli.time_s)
-    found = shortfalls([(block, observed)], {}, unobserved_s, 20_000.0)
+    found = shortfall_findings([(block, observed)], {}, unobserved_s, 20_000.0)
     assert [finding.message.partition("lacks: ")[2] for finding in found] == expected
 
 

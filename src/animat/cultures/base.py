@@ -21,7 +21,7 @@ from animat.cultures.limits import Limits
 from animat.cultures.observed import Observed, Spikes, assemble, following, with_rests
 from animat.cultures.openable import Openable
 from animat.cultures.safety import SIMULATED_LIMITS, Admitted
-from animat.cultures.shortfalls import shortfalls
+from animat.cultures.shortfalls import shortfall_findings
 from animat.errors import AnimatError, InvalidArgument, expect_kind, some_of
 from animat.progress import Progress, Silent
 from animat.recordings.recorded_culture import RecordedCulture
@@ -259,7 +259,7 @@ class Culture(Openable):
         def so_far() -> Recording:
             blocks, observed = zip(*parts, strict=True)
             left_out = Counter(self.left_out) - Counter(before)
-            findings = tuple(shortfalls(parts, left_out, unobserved_s, rate_hz))
+            findings = tuple(shortfall_findings(parts, left_out, unobserved_s, rate_hz))
             lacks = {"left_out": ", ".join(f"{n} {what}" for what, n in left_out.items())} if left_out else {}
             recorded = assemble(
                 replace(schedule, blocks=blocks), observed, sampling_rate_hz=rate_hz, start_min=start_min, **about

@@ -18,7 +18,7 @@ LATE_SHARE, LOST_SHARE = 0.1, 0.01
 """Shares of the stimuli, and of the frames or spikes, above which there is a warning."""
 
 
-def shortfalls(
+def shortfall_findings(
     parts: Sequence[tuple[Block, Observed]], left_out: Mapping[str, int], unobserved_s: float, rate_hz: float
 ) -> Iterator[Finding]:
     """Findings on what a recording lacks (`left-out`), and on stimuli that came late (`late-stimuli`).

@@ -13,7 +13,7 @@ from animat.errors import InvalidArgument, UnusableData
 from animat.recordings.findings import Finding, merged
 from animat.recordings.metadata import culture_of, date_of
 from animat.recordings.recording import Channels, Recording
-from animat.recordings.time_quality import late_start
+from animat.recordings.time_quality import start_unknown
 from animat.stimulation.protocol import Presentation
 from animat.stimulation.stimulus import NOTHING, Stimuli
 from animat.tables import UNKNOWN, expect_times
@@ -74,7 +74,7 @@ class PlainColumns:
         noted += self._mixed_up()
         channels, rows = self._channels(len(spike_time_s), noted)
         if self.start_s is None:
-            noted += late_start(spike_time_s, stimulus_time_s)
+            noted += start_unknown(spike_time_s, stimulus_time_s)
         stimuli, names = self._stimuli(stimulus_time_s, stimuli_in_time, noted)
         event_s = np.concatenate([spike_time_s, stimulus_time_s])
         start_s = float(event_s.min(initial=0.0) if self.start_s is None else self.start_s)

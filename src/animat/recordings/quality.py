@@ -9,7 +9,7 @@ import numpy as np
 from animat.errors import counted, some_of
 from animat.recordings.findings import Finding
 from animat.recordings.recording import Recording, ResponseTable
-from animat.recordings.time_quality import frequency_findings, silences, time_findings
+from animat.recordings.time_quality import frequency_findings, silence_findings, time_findings
 from animat.stimulation.frequency import is_same
 from animat.tables import UNKNOWN
 
@@ -54,7 +54,7 @@ def _in_data(recording: Recording) -> Iterable[Finding]:
     else:
         yield from _on_channels(recording)
     yield from time_findings(recording)
-    yield from silences(recording)
+    yield from silence_findings(recording)
     if recording.sampling_rate_hz < SLOWEST_HZ:
         message = f"no spikes can be detected at a sampling rate of {recording.sampling_rate_hz:g} Hz: is it in kHz?"
         yield Finding("sampling-rate", "warning", message, recording.sampling_rate_hz)

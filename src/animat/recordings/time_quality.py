@@ -241,7 +241,7 @@ def _separate_clocks(recording: Recording) -> str | None:
     return f"times cannot all be in seconds: {share}: {remedy}"
 
 
-def late_start(spike_time_s: np.ndarray, stimulus_time_s: np.ndarray) -> Iterator[Finding]:
+def start_unknown(spike_time_s: np.ndarray, stimulus_time_s: np.ndarray) -> Iterator[Finding]:
     """A finding if a recording with an unknown start, assumed to be 0, has its first event much later."""
     event_s = np.sort(np.concatenate([spike_time_s, stimulus_time_s]))
     if len(spike_time_s) < LATE_SPIKES:
@@ -256,7 +256,7 @@ def late_start(spike_time_s: np.ndarray, stimulus_time_s: np.ndarray) -> Iterato
         yield Finding("start-unknown", "warning", message, first_s)
 
 
-def silences(recording: Recording) -> Iterator[Finding]:
+def silence_findings(recording: Recording) -> Iterator[Finding]:
     """A finding if all channels are silent for far longer than at any other time."""
     if len(recording.spike_times_s) < SILENT_SPIKES:
         return
