@@ -38,7 +38,7 @@ from animat.stimulation import protocol
 from animat.studies.folder import MANIFEST, RECEIPTS, claim_folder
 from animat.studies.results import write_records
 from animat.studies.run import run_jobs
-from animat.studies.specification import Episodes, Resolution
+from animat.studies.specification import EpisodeCount, Resolution
 from animat.studies.task import derived_seed
 from animat.studies.training import work_on
 from animat.training.folder import versions_of
@@ -72,8 +72,8 @@ class ContextStudy:
     robots: tuple[str, ...] = ("cartpole", "navigation", "swing-up", "shuttle")
     policies: Policies = 4
     iterations_share: Positive = 0.5
-    episodes: Episodes = 400
-    episodes_measured: Episodes = 5
+    episodes: EpisodeCount = 400
+    episodes_measured: EpisodeCount = 5
     optimum_resolution: Resolution = 0.5
     seed: Seed = 1
 

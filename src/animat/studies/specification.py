@@ -52,7 +52,7 @@ def _unconverted(number: float, check: ValidatorFunctionWrapHandler) -> float:
 Name = Annotated[str, AfterValidator(_check_name)]
 Numbers = dict[str, Annotated[float, Strict(), WrapValidator(_unconverted)]]
 """Numbers by name, unconverted: 64 stays an integer."""
-Episodes = Annotated[Whole, Field(ge=1, le=MOST_AT_ONCE)]
+EpisodeCount = Annotated[Whole, Field(ge=1, le=MOST_AT_ONCE)]
 Resolution = Annotated[Number, Field(ge=0.1, le=FINEST_RESOLUTION)]
 
 
@@ -222,7 +222,7 @@ class Compared:
     first: str
     second: str
     at_min: Number | None = None
-    episodes: Episodes = 100
+    episodes: EpisodeCount = 100
 
     def __post_init__(self) -> None:
         if self.first == self.second:
@@ -260,8 +260,8 @@ class Study:
     policies: Policies = 10
     seed: Seed = 1
     training_min: Positive = 60.0
-    episodes: Episodes = 100
-    episodes_over_time: Episodes = 30
+    episodes: EpisodeCount = 100
+    episodes_over_time: EpisodeCount = 30
     actions: Literal["most probable", "drawn"] = "most probable"
     optimum_resolution: Resolution = 1.0
     optimum_episodes: Annotated[Whole, Field(ge=2, le=MOST_AT_ONCE)] = 4000

@@ -13,7 +13,7 @@ from pydantic import Field
 from animat.errors import InvalidArgument, InvalidFile, did_you_mean, in_file, shown, within
 from animat.records import Flag, Number, Seed, Whole, read_record, record
 from animat.robots.host import HostRobot
-from animat.studies.specification import Episodes, Study
+from animat.studies.specification import EpisodeCount, Study
 from animat.studies.toml import read_specification, study_from
 from animat.training.settings import SAC
 from animat.training.specification import CHUNKS
@@ -200,7 +200,7 @@ class Tune:
     policies: Annotated[Whole, Field(ge=1, le=100)] = 2
     rungs: Annotated[Whole, Field(ge=1, le=6)] = 3
     keep: Annotated[Whole, Field(ge=2, le=CHUNKS)] = 3
-    episodes: Episodes = 100
+    episodes: EpisodeCount = 100
     finalists: Annotated[Whole, Field(ge=1, le=1_000)] = 3
     seed: Seed = 1
     search: dict[str, Any] | None = None
