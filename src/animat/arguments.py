@@ -95,7 +95,7 @@ def checked_arguments(thing: Thing) -> Thing:
 
 
 def check_argument(name: str, value: Any, hint: Any) -> None:
-    """Raise InvalidArgument for a single argument that is not of a kind; for where the decorator cannot stand."""
+    """Raise InvalidArgument for one argument of another kind, where the decorator cannot be used."""
     if strangers := _unfitting(value, hint):
         raise InvalidArgument(f"{name}: expected {_words(hint)}, got {shown(strangers[0])}")
 

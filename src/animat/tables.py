@@ -87,7 +87,7 @@ def expect_times(name: str, times_s: Float64[np.ndarray, " times"]) -> None:
 
 
 def expect_rising_times(name: str, times_s: Float64[np.ndarray, " times"]) -> None:
-    """The same, also for times that fall."""
+    """`expect_times`, also for times that fall."""
     expect_times(name, times_s)
     if np.any(np.diff(times_s) < 0):
         raise UnusableData(f"{name}: expected times that do not fall; sort them with their channels first")

@@ -245,7 +245,7 @@ class IdealActuator(Animat[RobotState]):
 def replace_innermost(
     environment: Environment[RobotState], change: Callable[[Environment[RobotState]], Environment[RobotState]]
 ) -> Environment[RobotState]:
-    """The same wrappers around a changed innermost environment."""
+    """The environment with its wrappers around a changed innermost one."""
     if isinstance(environment, Wrapper):
         return replace(environment, inside=replace_innermost(environment.inside, change))
     return change(environment)

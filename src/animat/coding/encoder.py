@@ -155,7 +155,7 @@ def electrode_pulses(conditions: Sequence[Condition], pulses: int) -> tuple[floa
 
 
 def expect_electrode_pulses(conditions: Sequence[Condition], pulses: int) -> tuple[float, ...]:
-    """The same where the cost is required; raises UnusableData if they are not known."""
+    """`electrode_pulses` where they have a cost; raises UnusableData if they are not known."""
     counts = electrode_pulses(conditions, pulses)
     if counts is None:
         labels = ", ".join(condition.label for condition in conditions)

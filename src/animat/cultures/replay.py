@@ -84,7 +84,7 @@ class ReplayCulture(ComputedCulture):
 
     @property
     def stimulation_electrodes(self) -> tuple[int, ...]:
-        """Those that were stimulated in the recordings, also on places, which need not be patterns."""
+        """The electrodes stimulated in the recordings, also on places, which need not be patterns."""
         stimulated = np.unique(np.concatenate([each.stimuli.electrodes.ravel() for each in self._recordings]))
         return tuple(stimulated[stimulated != UNKNOWN].tolist())
 
@@ -99,7 +99,7 @@ class ReplayCulture(ComputedCulture):
 
     @property
     def sampling_rate_hz(self) -> float:
-        """That of the recordings; 20 kHz if it is not known."""
+        """The rate of the recordings; 20 kHz if it is not known."""
         rate_hz = self._recordings[0].sampling_rate_hz
         return rate_hz if np.isfinite(rate_hz) else 20_000.0
 

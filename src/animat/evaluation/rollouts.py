@@ -311,7 +311,7 @@ def _roll_out_called(
     key: PRNGKeyArray,
     starts: Key[Array, " episodes"] | None,
 ) -> tuple[Any, ...]:
-    """The same for a controller outside JAX, with the same random numbers."""
+    """`roll_out` for a controller outside JAX, with the same random numbers."""
     called_episodes = CalledEpisodes(called, environment)
     course, of_iteration = _begin_in_jit(environment, episodes, simulator, key, starts)
     for each in of_iteration:

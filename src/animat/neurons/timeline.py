@@ -118,7 +118,7 @@ class SimulatorTimeline:
         return max(0, int(np.searchsorted(self.start_min, minute + _ROUNDING_MIN, side="right")) - 1)
 
     def requested_row(self, minute: float) -> int:
-        """The same for a minute that a user gave; raises InvalidArgument for one before the first recording, or NaN."""
+        """`row_at` a minute that a user gave; raises InvalidArgument for one before the first recording, or NaN."""
         if not minute >= self.start_min[0]:
             first = f"the first recording on, which started at {self.start_min[0]:g} min"
             raise InvalidArgument(f"at_min: expected a minute on the culture's clock from {first}, got {minute:g}")

@@ -182,7 +182,7 @@ class Calibration:
         return calibration.with_percentiles(timeline.with_percentiles("first").at(start_min).percentiles)
 
     def with_percentiles(self, percentiles: Any) -> Self:
-        """The same with one set of percentiles in all simulators, independent of their responses."""
+        """The calibration with one set of percentiles in all simulators, independent of their responses."""
         fitted: Any = (self.simulator, *self.bootstraps)
         simulator, *bootstraps = (replace(each, percentiles=percentiles) for each in fitted)
         own = np.asarray(percentiles, np.float64)

@@ -66,7 +66,7 @@ class AgentPrediction(NamedTuple):
         return np.asarray(self.commanded.presented / self.returns.size)
 
     def of_start(self, number: int) -> AgentPrediction:
-        """The same for one of the starts; its commands are still those from all starts."""
+        """The prediction from one of the starts; its commands are still those from all starts."""
         one = slice(number, number + 1)
         return self._replace(returns=self.returns[one], bootstrap_means=self.bootstrap_means[:, one])
 

@@ -78,7 +78,7 @@ class Simulation:
     def agents(
         self, policies: Mapping[str, Controller], controls: Sequence[Control], calibration: Calibration
     ) -> list[Agent]:
-        """Those that take turns in the loop: the policies, then the controls."""
+        """What takes turns in the loop: the policies, then the controls."""
         pooled = np.concatenate(calibration.responses_hz)
         own = [Agent(name, self.trained.meaning, controller) for name, controller in policies.items()]
         return own + [agent_of(control, self.animat, policies, pooled) for control in controls]

@@ -72,7 +72,7 @@ def merged(findings: Iterable[Finding]) -> tuple[Finding, ...]:
 
 
 def without_notes(findings: Iterable[Finding]) -> tuple[Finding, ...]:
-    """Those that are warnings, or refuse what they are about."""
+    """The findings of severity warning or refuse."""
     return tuple(finding for finding in findings if finding.severity != "note")
 
 

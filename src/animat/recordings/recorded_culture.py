@@ -41,7 +41,7 @@ class RecordedCulture:
     names: tuple[tuple[str, str], ...] = ()
 
     def __str__(self) -> str:
-        """As messages name its kind."""
+        """Its kind, for messages."""
         name = _KINDS.get(self.kind or "", self.kind or "culture")
         return f"{name} (the SDK's simulator)" if self.is_simulated else name
 

@@ -41,7 +41,7 @@ class StudyOptimum:
 
     @property
     def known(self) -> Optimum | None:
-        """The same with NaN for unknown values; None without a value."""
+        """The optimum with NaN for unknown numbers; None without a value."""
         if self.best_return is None or self.grid_error is None:
             return None
         runs = self.monte_carlo, self.standard_error, self.without_clock, self.without_clock_standard_error
@@ -50,7 +50,7 @@ class StudyOptimum:
 
     @property
     def is_surpassed(self) -> bool:
-        """As of `Optimum`."""
+        """`Optimum.is_surpassed`."""
         return self.known is not None and self.known.is_surpassed
 
     def findings(self) -> tuple[Finding, ...]:

@@ -247,7 +247,7 @@ def extract_series(
 
 
 def _on_recording(recording: Recording | ResponseTable, responses: Responses) -> Iterator[Finding]:
-    """What else the recording is refused or doubted for; of warnings with the same name the responses' say more."""
+    """What refuses the recording, and its warnings but those that the responses have, too: theirs say more."""
     known = {finding.name for finding in responses.findings}
     for finding in recording_findings(recording):
         if finding.severity == "refuse" or (finding.severity == "warning" and finding.name not in known):

@@ -189,7 +189,7 @@ def inspect_recording(
 
 
 def _gravest_first(source: Recording | ResponseTable, responses: Responses) -> tuple[Finding, ...]:
-    """Of findings with the same name, the responses' say more than the recording's, except on missing stimuli."""
+    """All findings; of those with the same name the responses', which say more, except on missing stimuli."""
     found = [finding for finding in responses.findings if finding.name != "no-stimuli"]
     names = {finding.name for finding in found}
     found += [finding for finding in recording_findings(source) if finding.name not in names]

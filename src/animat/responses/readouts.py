@@ -130,7 +130,7 @@ def readouts_named(text: str) -> str | Readouts:
 
 
 def read_readouts(text: str | os.PathLike[str]) -> str | Readouts:
-    """The same, or the name of a file with such JSON; raises InvalidFile if it cannot be read."""
+    """As `readouts_named`, or the name of a file with such JSON; raises InvalidFile if it cannot be read."""
     if text in NAMED or str(text).lstrip().startswith("{"):
         return readouts_named(str(text))
     written = read_groups("readouts", NAMED, text)

@@ -175,7 +175,7 @@ def grid_for(robot: Robot[Any]) -> Grid:
 
 
 def grid_of_optimum(robot: Robot[Any]) -> Grid:
-    """The same for an optimal return; InvalidArgument, too, for one that is unsuited."""
+    """`grid_for` an optimal return; InvalidArgument also for a grid that is unsuited."""
     grid = grid_for(robot)
     if grid.unsuited:
         raise InvalidArgument(grid.unsuited)

@@ -23,7 +23,7 @@ def code_of(thing: Any) -> dict[str, str]:
 
 
 def code_at(module: str, name: str) -> dict[str, str]:
-    """The same for a module by its name, as the code of what is called `name`."""
+    """The fingerprint of a module, as the code of what is called `name`."""
     with suppress(OSError, ValueError, SyntaxError, ImportError, RecursionError):
         file = getattr(sys.modules.get(module), "__file__", None) or getattr(find_spec(module), "origin", None)
         if file is not None:

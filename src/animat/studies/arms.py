@@ -27,7 +27,7 @@ _SHUFFLED = "the delivered stimulus is drawn at random, whatever the policy choo
 
 
 def summarise_arms(study: Study) -> str:
-    """What an arm is, then how many arms and policies there are; the second sentence is left open."""
+    """What an arm is, then how many arms and policies there are, in a sentence that the caller ends."""
     are, policies = "is" if len(study.arms) == 1 else "are", counted(study.policies, "policy", "policies")
     return f"An arm is one way to train policies. There {are} {counted(len(study.arms), 'arm')} with {policies} each"
 

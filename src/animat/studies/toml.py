@@ -73,7 +73,7 @@ def _with_current_keys(data: dict[str, Any]) -> dict[str, Any]:
 
 
 def _rename_keys(table: Any, names: dict[str, str]) -> Any:
-    """The same for a table, or each in a list; anything else is refused later."""
+    """The table, or each in a list, with current keys; anything else is refused later."""
     if isinstance(table, list):
         return [_rename_keys(each, names) for each in table]
     if not isinstance(table, dict):
