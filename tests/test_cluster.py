@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
+import pickle
 import random
 import re
 import shlex
@@ -12,10 +14,11 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import wait
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any, NoReturn, TextIO
 
 import pytest
 
@@ -23,6 +26,7 @@ from animat.cli import _parse, main
 from animat.errors import AnimatError, InvalidFile, Mismatch
 from animat.execution.cluster import Cluster, local_cluster
 from animat.execution.dask_worker import _own_cores, versions_tag
+from animat.execution.dispatch import Call
 from animat.execution.jobs import PLANNED, Job, Jobs
 from animat.execution.task import Task, bring_back, carry_out_unshared, store
 from animat.progress import Progress, Silent
@@ -47,10 +51,30 @@ def test_without_dask_or_a_scheduler_it_is_a_line(
 def test_while_no_scheduler_answers_a_line_says_what_is_waited_for(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    logger = logging.getLogger("distributed")
+    monkeypatch.setattr(logger, "level", logging.INFO)
     monkeypatch.setattr("animat.execution.cluster._CONNECT_S", 0.3)
     with pytest.raises(AnimatError, match="no scheduler answers"):
         Cluster("tcp://127.0.0.1:9")
     assert capsys.readouterr().err.count("cluster: waiting up to 0.3 s for the scheduler at tcp://127.0.0.1:9\n") == 1
+    assert logger.level == logging.INFO
+
+
+def test_a_host_that_drops_packets_is_said_to_be_waited_for_at_once(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    patience_s = []
+
+    def drop(_: tuple[str, int], timeout: float) -> NoReturn:
+        patience_s.append(timeout)
+        raise TimeoutError("timed out")
+
+    monkeypatch.setattr("animat.execution.cluster._CONNECT_S", 0.3)
+    monkeypatch.setattr("socket.create_connection", drop)
+    with pytest.raises(AnimatError, match="no scheduler answers"):
+        Cluster("tcp://127.0.0.1:9")
+    assert patience_s[0] <= 5
+    assert "cluster: waiting up to 0.3 s" in capsys.readouterr().err
 
 
 def test_a_worker_takes_cores_in_a_folder_of_its_own_user_and_follows_no_link(
@@ -104,6 +128,8 @@ def test_a_place_that_is_no_scheduler_s_is_a_line(tmp_path: Path, capsys: pytest
             "no.json",
             "animat: --cluster: expected a scheduler's address, such as tcp://host:8786, or its file, got 'no.json'",
         ),
+        ("tcp://myhost", "an address that ends in a port, such as tcp://host:8786, got tcp://myhost"),
+        ("myhost:", "an address that ends in a port, such as tcp://host:8786, got myhost:"),
         (str(tmp_path / "cluster.json"), "expected a scheduler's file, got one without an address"),
     ):
         assert main(["study", str(TINY), "--out", str(tmp_path / "out"), "--cluster", where]) == 1
@@ -201,6 +227,24 @@ def test_what_fails_twice_is_done_and_thrice_is_reported(running: Running, tmp_p
     assert (tmp_path / "thrice").read_text().count("tried") == 3
     assert {path.stem for path in (tmp_path / "jobs").iterdir()} == {"twice", "other"}
     assert [*json.loads((tmp_path / ".unfinished" / PLANNED).read_text())] == [job.name for job in jobs]
+
+
+@oracle
+def test_what_goes_wrong_with_one_result_is_reported_and_the_others_arrive(running: Running) -> None:
+    def fail(_: float) -> NoReturn:
+        raise OSError("too many open files")
+
+    def call(takes_s: float, finish: Callable[[float], float] | None = None) -> Call:
+        pickled = pickle.dumps((rest, (takes_s,), {}))
+        return Call("rest", lambda _: pickled, cost_s=0.01, finish=finish)
+
+    with Cluster(running.file) as cluster:
+        # Both workers are busy at first, so that the others go in batches.
+        calls = [call(1.0), call(1.0), *(call(0.0, fail if i == 3 else None) for i in range(60))]
+        futures = [cluster._submit(each) for each in calls]
+        assert not wait(futures, timeout=60).not_done
+        assert [i for i, future in enumerate(futures) if future.exception() is not None] == [5]
+        assert isinstance(futures[5].exception(), OSError)
 
 
 @oracle

@@ -7,6 +7,7 @@ import hashlib
 import json
 import multiprocessing
 import os
+import pickle
 import random
 import re
 import shutil
@@ -336,18 +337,27 @@ def test_a_folder_that_is_gone_may_have_been_removed_or_be_out_of_sight(tmp_path
         carry_out_alone(Join("a"), gone, gone / ".notices" / "a")
 
 
-@pytest.mark.oracle
-def test_too_many_open_files_are_not_taken_for_too_little_memory(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        pytest.param(
+            OSError(errno.EMFILE, os.strerror(errno.EMFILE)),
+            r"job: .*Too many open files \(.*`ulimit -n` raises",
+            marks=pytest.mark.oracle,
+        ),
+        (pickle.PicklingError("not a function"), "^job: PicklingError: not a function; run again to continue$"),
+    ],
+)
+def test_what_an_executor_raises_is_not_taken_for_too_little_memory(
+    error: Exception, words: str, tmp_path: Path
+) -> None:
     class Full(ThreadPoolExecutor):
         def submit(self, *_: Any, **__: Any) -> Any:
             future: Future[Any] = Future()
-            future.set_exception(OSError(errno.EMFILE, os.strerror(errno.EMFILE)))
+            future.set_exception(error)
             return future
 
-    with (
-        Full() as executor,
-        pytest.raises(AnimatError, match=r"job: .*Too many open files \(.*`ulimit -n` raises") as raised,
-    ):
+    with Full() as executor, pytest.raises(AnimatError, match=words) as raised:
         run([Job("job", Join("a"))], tmp_path, executor)
     assert "memory" not in str(raised.value)
 

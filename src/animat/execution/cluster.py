@@ -30,8 +30,9 @@ from animat.process import own_cores
 P = ParamSpec("P")
 T = TypeVar("T")
 _CONNECT_S = 60
+_ATTEMPT_S = 2.0
 _PATIENCE_S = 10.0
-_RUN = """
+_RUN_MODULE = """
 import runpy, sys
 from animat.process import end_with_parent
 end_with_parent()
@@ -64,25 +65,25 @@ class Cluster(Executor):
         self, where: str | os.PathLike[str], *, longest_s: float = LONGEST_S, has_shared_folder: bool = True
     ) -> None:
         distributed = expect_distributed()
-        # `Dispatch` reports losses itself.
-        for name in ("distributed", "distributed.client"):
-            logging.getLogger(name).setLevel(logging.CRITICAL)
         address = _address(where)
-        try:
-            _expect_listener(address)
-            self._client = distributed.Client(address, timeout=_CONNECT_S, set_as_default=False)
-        except (OSError, ValueError) as error:
-            raise AnimatError(f"cluster: {where}: no scheduler answers ({first_line(error)}); start it") from error
         self._refused: set[str] = set()
         self._futures: set[Future[Any]] = set()
         self._has_shared_folder, self._local = has_shared_folder, PinnedProcesses(own_cores()[-1:])
-        try:
+        with ExitStack() as closing:
+            # `Dispatch` reports losses itself.
+            for logger in map(logging.getLogger, ("distributed", "distributed.client")):
+                closing.callback(logger.setLevel, logger.level)
+                logger.setLevel(logging.CRITICAL)
+            try:
+                _expect_listener(address)
+                self._client = distributed.Client(address, timeout=_CONNECT_S, set_as_default=False)
+            except (OSError, ValueError) as error:
+                raise AnimatError(f"cluster: {where}: no scheduler answers ({first_line(error)}); start it") from error
+            closing.callback(self._client.close)
             workers = self._client.scheduler_info()["workers"]
             if workers and not self._usable(workers):
                 raise Mismatch(f"cluster: {_why_refused(*next(iter(workers.items())))}, and there is no other")
-        except BaseException:
-            self._client.close()
-            raise
+            self._closing = closing.pop_all()
         if not workers:
             print("cluster: waiting for workers", file=sys.stderr)
         self._dispatch = Dispatch(self._client, self._usable, longest_s)
@@ -123,7 +124,7 @@ class Cluster(Executor):
         else:
             self._local.kill_workers()
         self._dispatch.close()
-        self._client.close()
+        self._closing.close()
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         self.shutdown(wait=kind is None)
@@ -153,7 +154,7 @@ def _why_refused(address: str, worker: dict[str, Any]) -> str:
 
 
 def _expect_listener(address: str) -> None:
-    """Wait for a listener, as Dask's own wait cannot be interrupted; raises OSError or ValueError if there is none."""
+    """Wait for a listener, as Dask's own wait cannot be interrupted; raises OSError if there is none."""
     kind, has_kind, place = address.rpartition("://")
     host, _, port = place.rpartition(":")
     if has_kind and kind != "tcp":
@@ -161,7 +162,7 @@ def _expect_listener(address: str) -> None:
     until_s = time.monotonic() + _CONNECT_S
     for attempt in itertools.count():
         try:
-            socket.create_connection((host.strip("[]"), int(port)), timeout=_CONNECT_S).close()
+            socket.create_connection((host.strip("[]"), int(port)), timeout=_ATTEMPT_S).close()
             return
         except OSError:
             if time.monotonic() > until_s:
@@ -183,6 +184,9 @@ def _address(where: str | os.PathLike[str]) -> str:
             f"cluster: expected a scheduler's address, such as tcp://host:8786, or its file, got {str(where)!r}, "
             "which is not a file"
         )
+    kind, has_kind, place = str(where).rpartition("://")
+    if (not has_kind or kind == "tcp") and not place.rpartition(":")[2].isdecimal():
+        raise InvalidArgument(f"cluster: expected an address that ends in a port, such as tcp://host:8786, got {where}")
     return str(where)
 
 
@@ -232,7 +236,7 @@ def _start(part: str, file: Path, *options: str) -> subprocess.Popen[bytes]:
     # The path as for pinned processes: robots may be defined next to a script.
     own = {"DASK_LOGGING__DISTRIBUTED": "critical", "PYTHONPATH": os.pathsep.join(sys.path)}
     return subprocess.Popen(
-        [sys.executable, "-c", _RUN, module, "--no-dashboard", "--scheduler-file", file, *options],
+        [sys.executable, "-c", _RUN_MODULE, module, "--no-dashboard", "--scheduler-file", file, *options],
         env={**os.environ, **own},
         # Ctrl-C reaches only this process, which then ends the others.
         process_group=0,

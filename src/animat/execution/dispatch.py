@@ -18,7 +18,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, final
 
-from animat.errors import AnimatError
 from animat.execution.dask_worker import PLACE_PREFIX, CallResult, topic_of, work
 
 ATTEMPTS = 3
@@ -83,6 +82,7 @@ class _Place:
 
     @property
     def free(self) -> int:
+        """The calls or batches that it has room for."""
         return 0 if any(batch.is_alone for batch in self.batches) else self.threads - len(self.batches)
 
 
@@ -222,7 +222,6 @@ class Dispatch:
         try:
             await self._send(batch)
         except Exception as error:
-            # Any error is passed on, as somebody is waiting.
             _give_up(batch.calls, error)
         batch.place.batches.remove(batch)
         self._assign()
@@ -310,7 +309,8 @@ class Dispatch:
             try:
                 value = answer.value if call.finish is None or answer.error is not None else call.finish(answer.value)
                 _settle(call, value, answer.error)
-            except AnimatError as error:
+            except Exception as error:
+                # Any error is passed on, as somebody is waiting.
                 _settle(call, error=error)
 
     def _end(self, error: Exception | None = None) -> None:

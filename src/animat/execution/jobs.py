@@ -8,13 +8,13 @@ import math
 import signal
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, wait
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future, wait
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from graphlib import TopologicalSorter
 from pathlib import Path
 
-from animat.errors import AnimatError, InvalidArgument, counted, expect_at_least
+from animat.errors import AnimatError, InvalidArgument, counted, expect_at_least, first_line
 from animat.execution.cluster import Cluster
 from animat.execution.gpu import submit_with_gpu
 from animat.execution.pinned import PinnedProcesses
@@ -228,15 +228,19 @@ def _expect_success(future: Future[TaskResult], job: Job) -> None:
     except CancelledError as error:
         ended = "its executor, or the cluster's scheduler, has ended; start it, then run this again to continue"
         raise AnimatError(f"{job.name}: {ended}") from error
-    except Exception as error:
-        # Raised by the executor: a process ended, or a machine was lost.
+    except BrokenExecutor as error:
+        # A process ended, or a machine was lost. SIGTERM comes from a person or a program; the kernel uses SIGKILL when
+        # memory runs out.
         message = " ".join(str(error).split()) or type(error).__name__
-        # SIGTERM comes from a person or a program; the kernel uses SIGKILL when memory runs out.
         why = f"is there enough memory? {memory_of(job.task)}"
         if message.endswith(f"status {-signal.SIGTERM}"):
             why = "another program ended it"
         if message.endswith("status 0"):
             why = "code in it ended the process, such as that of a robot of your own"
-        if isinstance(error, OSError) and error.errno == errno.EMFILE:
-            why = "fewer --workers need fewer, and `ulimit -n` raises the limit"
         raise AnimatError(f"{job.name}: {message} ({why}); run again to continue") from error
+    except Exception as error:
+        # Raised by the executor, as when it cannot send the task.
+        why = ""
+        if isinstance(error, OSError) and error.errno == errno.EMFILE:
+            why = " (fewer --workers need fewer, and `ulimit -n` raises the limit)"
+        raise AnimatError(f"{job.name}: {first_line(error)}{why}; run again to continue") from error
