@@ -256,6 +256,11 @@ def test_recordings_on_disk_are_the_neurons(tmp_path) -> None:
         ({"recordings": "r", "window_ms": (2, 4, 8)}, r"window_ms: expected two numbers .*, got \(2, 4, 8\)"),
         ({"goal": "drive speed above 1"}, "goal: .*speed"),
         ({"neural_observation": 1}, "neural_observation: expected True or False, got 1"),
+        # All of them before recordings are looked for.
+        ({"neural_observation": 1, "recordings": "missing"}, "neural_observation: expected True or False, got 1"),
+        ({"delivery": "late", "recordings": "missing"}, "delivery: expected 'chosen' or 'shuffled', got 'late'"),
+        ({"mapping": "3-thresholds", "recordings": "missing"}, "mapping: expected one of 1-threshold"),
+        ({"kind": "bins", "recordings": "missing"}, "kind: expected one of histogram, empirical, memory, got 'bins'"),
     ],
 )
 def test_bad_options_are_refused_in_one_line(options: dict, message: str) -> None:

@@ -21,7 +21,7 @@ _ONE = {
     "Channels": "a channel table, animat.Channels",
     "Culture": "a culture, such as animat.VirtualCulture(seed=1)",
     "Detection": "settings of spike detection, such as animat.recordings.detection.settings.Detection()",
-    "Environment": "an environment, such as animat.Animat(animat.Cartpole(), animat.Thresholds(9), 9)",
+    "Environment": "an environment, such as animat.Animat(animat.Cartpole(), animat.Thresholds(9), 5)",
     "Executor": "an executor, such as a concurrent.futures.ProcessPoolExecutor",
     "Goal": "a goal, such as 'avoid pole_angle outside -12..12 deg'",
     "Mapping": "a mapping, such as animat.Thresholds(9)",

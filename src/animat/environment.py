@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from animat.arguments import check_argument
 from animat.coding.decoder import decode, expect_one_command, expect_readout_per_command
 from animat.coding.mapping import Mapping
-from animat.errors import InvalidArgument
+from animat.errors import InvalidArgument, expect_at_least
 from animat.neurons.history import INITIAL_HISTORY
 from animat.neurons.simulator import Answer, NeuronSimulator
 from animat.robots.base import Quantity, Robot
@@ -149,8 +149,12 @@ class Environment(abc.ABC, Generic[RobotState]):
 class Animat(Environment[RobotState]):
     """A robot moved by the responses of neurons to the conditions that the agent picks.
 
+    Attributes:
+        mapping: from the neurons' response to the robot's command.
+        n_conditions: the number of actions: the simulator's `n_conditions`.
+
     Raises:
-        InvalidArgument: for anything but a robot and a mapping, such as their names.
+        InvalidArgument: for anything but a robot and a mapping, such as their names, or no condition.
     """
 
     robot: Robot[RobotState]
@@ -161,6 +165,8 @@ class Animat(Environment[RobotState]):
         # Not by `checked_arguments`: the type checker of the tests would resolve annotations in the decorator's module.
         check_argument("robot", self.robot, Robot)
         check_argument("mapping", self.mapping, Mapping)
+        check_argument("n_conditions", self.n_conditions, int)
+        expect_at_least("n_conditions", self.n_conditions, 1)
 
     @property
     def n_actions(self) -> int:

@@ -65,7 +65,11 @@ def unwrapped(environment: Environment[RobotState], to: type[Wrapper[Any]] | tup
 @final
 @dataclass(frozen=True)
 class EpisodeLimit(Wrapper[RobotState]):
-    """Truncates an episode at the robot's `episode_limit`, unless the task ends by itself."""
+    """Truncates an episode at the robot's `episode_limit`, unless the task ends by itself.
+
+    Attributes:
+        inside: the environment that it is put around, such as an `Animat`.
+    """
 
     def advance(self, uniforms: Uniforms, state: State, action: Array, simulator: Neurons) -> State:
         after = self.inside.advance(uniforms, state, action, simulator)
@@ -86,6 +90,9 @@ class NeuralWrapper(Wrapper[RobotState]):
 @dataclass(frozen=True)
 class ShuffledDelivery(NeuralWrapper[RobotState]):
     """Delivers a random condition at each iteration, whatever was chosen: the paper's control (section 3.2).
+
+    Attributes:
+        inside: the environment that it is put around.
 
     Raises:
         InvalidArgument: around an environment without neurons.
@@ -108,6 +115,9 @@ class NeuralObservation(NeuralWrapper[RobotState]):
     """Appends the history state of the neurons (`State.neurons`) to the observation.
 
     A simulator's next answer depends on trace and load alone; a simulator without memory leaves both at 0.5.
+
+    Attributes:
+        inside: the environment that it is put around.
 
     Raises:
         InvalidArgument: around an environment without neurons.

@@ -231,7 +231,7 @@ def describe_left_out(left_out: Mapping[str, int]) -> str:
 
 @checked_arguments
 def read_session(path: str | os.PathLike[str]) -> Session:
-    """Read a session from its folder or its log, whatever ended it; InvalidFile if that is missing or damaged."""
+    """Read a session, whatever ended it; `path`: its folder or its log; InvalidFile if that is missing or damaged."""
     path = Path(path)
     file = path / LOG_FILE if is_folder(path) else path
     if is_absent(file):

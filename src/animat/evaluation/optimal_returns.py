@@ -189,6 +189,7 @@ def optimal_returns(
         resolution: of the optimum's grid (`best_returns`); the default moves the cartpole's optima by at most 1.1.
         episodes: of random stimuli, of the best coupling, and of the optimum's controller.
         resamples: of the responses, for the optimum's interval (`WellSampled.with_interval`).
+        seed: decides every random draw.
         progress: optima, their intervals, and couplings take about as long each.
 
     Raises UnusableData if no condition has 30 non-burst responses.

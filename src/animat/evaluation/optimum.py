@@ -119,7 +119,13 @@ def bracket_findings(value: float, grid_error: float, monte_carlo: float, error:
 
 @checked_arguments
 def best_return(environment: Environment[Any], simulator: Neurons, **options: Any) -> Optimum:
-    """The optimal return in one environment; arguments, errors and method as in `best_returns`."""
+    """The optimal mean return of any controller in one environment.
+
+    Args:
+        simulator: what answers the stimuli; None without neurons.
+        options: `grid`, `resolution`, `episodes`, `seed` and `progress`, as in `best_returns`, which also has the
+            method and the errors.
+    """
     return best_returns([(environment, simulator)], **options)[0]
 
 
@@ -148,6 +154,8 @@ def best_returns(
         grid: over the robot's states; None: `grid_of_optimum(robot)`.
         resolution: factor for the steps of the grid along each axis; 0.6 is fast and coarse.
         episodes: of the controller; 0: it is not run, which is faster.
+        seed: of these episodes.
+        progress: updated as the returns of all cases are computed.
 
     Raises:
         InvalidArgument: for no cases, an environment of unknown effect, a robot without a grid, or an invalid number.

@@ -57,6 +57,7 @@ def evaluate(
         timeline: the culture's simulators; None for policies without neurons.
         at_min: minute on the culture's clock whose newest simulator is used; None: the last recording.
         episodes: of each policy and control.
+        seed: decides every random draw.
         greedy: whether to take the most probable action, or to draw from the policy as in training.
         robot: the robot to run them on, possibly with changed parameters; None: the one they were trained on.
         controls: names of the controls to run; None: all.

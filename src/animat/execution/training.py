@@ -66,6 +66,7 @@ def train(
             training starts again. This also allows robots and mappings that are not registered.
         workers: processes, each pinned to its own core; None: one per core. Not with an executor.
         executor: for the groups of policies; it must see the folder, and stays open. None: processes on this machine.
+        progress: updated as iterations are done, with the policies' returns so far.
         checkpoint_s: seconds between checkpoints, which a kill may cost; never changes the result.
         sources, random_return: names of the recordings and mean return of random actions, for manifest and live page.
         callbacks: called with every row of the learning curves as it is produced; they change no bit.

@@ -22,7 +22,7 @@ from animat.goals.goal import Goal
 from animat.goals.robot import with_goal
 from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.synthetic import LABELS, synthetic_simulator
-from animat.neurons.timeline import SimulatorKind, fit_timeline
+from animat.neurons.timeline import SimulatorKind, check_kind, fit_timeline
 from animat.recordings.findings import warnings_once
 from animat.recordings.reading import read_sources
 from animat.registry import is_ours
@@ -120,9 +120,17 @@ def set_up(
     for name, value in reading.items():
         if value is not None and recordings is None:
             raise InvalidArgument(f"{name}: expected only with recordings, as it sets how they are read")
+    # All that can be checked before recordings are read, which can take a while.
+    by = None if conditions is None else conditions_named(conditions)
+    if kind is not None:
+        check_kind(kind)
+    expect_kind("neural_observation", neural_observation, bool, "True or False")
+    if delivery not in ("chosen", "shuffled"):
+        raise InvalidArgument(f"delivery: expected 'chosen' or 'shuffled', got {delivery!r}")
+    chosen = mapping if isinstance(mapping, Mapping) else mapping_named(mapping)
+    if not is_ours(chosen):
+        check_mapping(chosen)
     if recordings is not None:
-        # Before recordings are read, which can take a while.
-        by = None if conditions is None else conditions_named(conditions)
         read = readouts or DEFAULT_READOUTS.get(body.n_commands, "all")
         series = extract_series(read_sources(recordings), by, window_ms, readouts=read)
         timeline = fit_timeline(series, kind=kind)
@@ -140,13 +148,7 @@ def set_up(
         )
     else:
         simulator, labels = synthetic_simulator(), LABELS
-    expect_kind("neural_observation", neural_observation, bool, "True or False")
-    if delivery not in ("chosen", "shuffled"):
-        raise InvalidArgument(f"delivery: expected 'chosen' or 'shuffled', got {delivery!r}")
     expect_readout_per_command(body.name, body.n_commands, simulator.n_readouts)
-    chosen = mapping if isinstance(mapping, Mapping) else mapping_named(mapping)
-    if not is_ours(chosen):
-        check_mapping(chosen)
     environment: Environment[Any] = Animat(body, chosen, simulator.n_conditions)
     if delivery == "shuffled":
         environment = ShuffledDelivery(environment)

@@ -273,15 +273,20 @@ def fit_simulator(
 
     Histograms of several readouts need `room`, too.
     """
+    check_kind(kind)
     if kind == "histogram" and len(responses.readouts) > 1:
         return fit_joint_histogram(responses, bins=bins, range_hz=range_hz, room=room)
     if kind == "histogram":
         return fit_histogram(responses, bins=bins, range_hz=range_hz)
     if kind == "empirical":
         return fit_empirical(responses, room=room)
-    if kind == "memory":
-        fitted = fit_memory(responses, room=room, memory=memory)
-        # Without memory the trace keeps its initial value, as for policies in a loop (`HistoryTracker`).
-        still = jnp.full_like(fitted.left, INITIAL_HISTORY[0])
-        return replace(fitted, left=still) if fitted.memory == NO_MEMORY else fitted
-    raise InvalidArgument(f"kind: expected one of {', '.join(get_args(SimulatorKind))}, got {kind!r}")
+    fitted = fit_memory(responses, room=room, memory=memory)
+    # Without memory the trace keeps its initial value, as for policies in a loop (`HistoryTracker`).
+    still = jnp.full_like(fitted.left, INITIAL_HISTORY[0])
+    return replace(fitted, left=still) if fitted.memory == NO_MEMORY else fitted
+
+
+def check_kind(kind: str) -> None:
+    """Raise InvalidArgument for a kind of simulators that does not exist."""
+    if kind not in get_args(SimulatorKind):
+        raise InvalidArgument(f"kind: expected one of {', '.join(get_args(SimulatorKind))}, got {kind!r}")

@@ -14,7 +14,7 @@ from animat.errors import InvalidArgument
 from animat.neurons.history import NO_MEMORY
 from animat.neurons.memory import MemorySimulator
 from animat.neurons.prediction import CLASSES, Halves, free_runs, halved, in_time, predict, recorded_series, share_below
-from animat.neurons.timeline import SimulatorKind, default_kind, fit_simulator
+from animat.neurons.timeline import SimulatorKind, check_kind, default_kind, fit_simulator
 from animat.responses.responses import Responses
 from animat.tables import briefly
 
@@ -101,8 +101,9 @@ class Validation:
     """All kinds of simulators on one recording: fitted to its first half, scored on its second.
 
     Attributes:
+        labels: of the conditions.
         n_fitted, n_held: non-burst responses to each condition in the first and the second half.
-        medians_hz: of these.
+        medians_hz: medians of the responses to each condition in the first and in the second half.
         above: P(x >= P50) of the held-out responses to each, P50 that of the first half.
         autocorrelation, run_length, lasting: of the held-out responses, as in `Scores`; runs at or above their own P50.
         scores: of the marginal distribution and of each kind.
@@ -218,8 +219,8 @@ def validate(responses: Responses, *, kind: str | None = None, seed: int = 1, re
     rng, halves = np.random.default_rng(seed), halved(responses, readout)
     median_hz = halves.percentiles_hz[5]
     kinds: tuple[str, ...] = get_args(SimulatorKind)
-    if kind is not None and kind not in kinds:
-        raise InvalidArgument(f"kind: expected one of {', '.join(kinds)}, got {kind!r}")
+    if kind is not None:
+        check_kind(kind)
     simulators = {each: fit_simulator(halves.first, kind=each) for each in kinds}
     distances, band = _chance_levels(halves, rng)
     probabilities: dict[str, Float64[np.ndarray, "held classes"]] = {}

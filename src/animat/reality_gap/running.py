@@ -84,9 +84,9 @@ def run_policies(
     The table is also written into the session's folder, as `returns.txt` and `returns.json`.
 
     All episodes are interleaved in random order on the one culture, so that drift affects all alike. The controls
-    together have no more episodes than the policies, except that each has at least `FEWEST_OF_A_CONTROL`: stimulation
-    for controls changes the culture for the policies. Under the silent and the shuffled controls the policies take
-    turns, one episode each.
+    together have no more episodes than the policies, except that each has at least five, or `episodes` if these are
+    fewer: stimulation for controls changes the culture for the policies. Under the silent and the shuffled controls the
+    policies take turns, one episode each.
 
     Args:
         policies: by name, all with the same robot, mapping and conditions.
@@ -101,6 +101,7 @@ def run_policies(
         greedy: whether policies take the most probable action, or draw as in training.
         seed: decides every random draw except those of the culture.
         pulses: per trial; None: as in the policies' recordings.
+        account: counts the pulses against a budget, together with what it has counted before; None: without a budget.
         progress: updated in each phase; in the closed loop with the returns so far.
         report: called with lines before the session: the warnings, and how long it will and can be.
         noticed: findings to report in addition to those made here.

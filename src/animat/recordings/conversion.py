@@ -47,8 +47,10 @@ class Origin:
         age: ISO 8601 duration, such as `P42D`, or a range of two separated by a slash.
         subject_description: such as `dissociated cortical culture`.
         experimenter: `Last, First`; several separated by semicolons.
+        institution, lab: where it was recorded.
         keywords: separated by commas.
         recorded_at: ISO 8601 date.
+        experiment_description: what the experiment was for.
 
     Raises:
         InvalidArgument: for a `species` that is not in Latin, an `age` that is not a duration, an `experimenter`
@@ -104,7 +106,9 @@ def convert_recording(
     """Read a recording in any format and write it as NWB; returns what was written.
 
     Args:
+        path: of the recording.
         out: the NWB file, complete or absent.
+        origin: who recorded what; None: as the file states.
         detection: detect spikes in raw traces with these settings; None: use the file's own spikes.
         reader: SpikeInterface's name of the format; spikes are then detected in its traces.
         stimuli_path, stimuli, part, start_min, start_s: as in `read_recording`.

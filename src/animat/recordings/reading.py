@@ -57,6 +57,7 @@ def read_recording(
     Problems noticed on the way are in its findings (see `animat.recordings.quality`).
 
     Args:
+        path: of the recording; of a CSV recording, the file of its spikes.
         stimuli_path: the stimulus file, for CSV only; by default the one next to the spikes.
         stimuli: which of several candidates in a file are the stimuli: in NWB from other programs, the name; in
             MaxWell, the events' type.
@@ -92,7 +93,7 @@ def read_source(
 ) -> Recording | ResponseTable:
     """Read any source of responses: a recording, or a response table without spikes.
 
-    Arguments and errors are those of `read_recording`.
+    `path`, `stimuli_path`, `stimuli` and `part` are as in `read_recording`, and so are the errors.
     """
     path = Path(path)
     begin = first_bytes(path)

@@ -204,11 +204,15 @@ def default_conditions(stimuli: Stimuli, protocol: Protocol | None = None) -> Co
 
 
 def conditions_named(text: str) -> Conditions:
-    """Read conditions from their text form; InvalidArgument for anything else.
+    """Read conditions, by which responses are sorted, from their text form; InvalidArgument for anything else.
 
-    `all`, `frequency`, `frequency:5,10`, `interval:5,10`, `interval:5,10+-25%`, `electrode`,
-    `electrode:23275,909+23923`, `pattern`, `pattern:0,3`, and products of frequency or interval with electrode or
-    pattern, `frequency:5,80 x pattern:0,3`.
+    - `all`: one condition;
+    - `frequency`: by the stated frequency of the stimulus; `frequency:5,10`: only 5 and 10 Hz;
+    - `interval:5,10`: by the time since the pulse before, within 25 % of 1/5 or 1/10 s; `interval:5,10+-10%`: within
+      10 %;
+    - `electrode`: by the set of stimulated electrodes; `electrode:23275,909+23923`: electrode 23275, or 909 and 23923;
+    - `pattern`: by the number of the pattern; `pattern:0,3`: only 0 and 3;
+    - `frequency:5,80 x pattern:0,3`: products of frequency or interval with electrode or pattern.
     """
     expect_kind("conditions", text, str, "text such as 'frequency:5,10'")
     with within("conditions"):

@@ -42,6 +42,8 @@ class Lesson:
     """Ranges from which each episode is drawn; whatever is not named keeps the value of the robot and its reset.
 
     Attributes:
+        name: what the lesson is called in tables.
+        parameters: ranges of the robot's parameters, such as `{"pole_mass_kg": (0.4, 0.7)}`.
         starts: ranges of numbers of the robot's state at the start of an episode, by name.
         recordings_min: an episode draws one of the recordings that started between these minutes; None: one of all.
         success: the share of an assessment's episodes that must succeed for the policy to move on.

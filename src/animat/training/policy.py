@@ -376,7 +376,7 @@ def first_of_alike(policies: Dict[str, Policy], attributes: Sequence[str], advic
 
 @checked_arguments
 def load_policies(path: str | os.PathLike[str]) -> dict[str, Policy]:
-    """Read one policy file, or all in a folder, by name, in the order of their numbers (p2 before p10).
+    """Read policies by name, in the order of their numbers (p2 before p10); `path`: a policy file, or a folder of them.
 
     Raises InvalidFile if there is none, or one cannot be read.
     """

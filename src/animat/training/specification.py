@@ -86,10 +86,12 @@ class Training:
             A closed loop computes it from the culture's responses; a live run refuses such policies.
         commands: without neurons, the commands to choose from; None: any in [-1, 1], as many as the robot takes.
         algorithm: settings of Soft Actor-Critic.
-        lessons: in turn, each with ranges for its episodes; after a last one with a threshold comes the task itself.
+        lessons: in turn, each with ranges for its episodes (`Lesson`); after a last one that has `success` or
+            `until_return` comes the task itself.
         pulse_cost: cost of an electrode pulse, in the units of the reward: policies are trained on the rewards minus
             the costs of their trials (`animat.coding.encoder`). Reported returns do not include the cost.
-        assess: episodes of each chunk's assessment, which keeps the best policy; None: none, but 20 for thresholds.
+        assess: episodes on which policies are assessed after each sixtieth of the training, to keep the best version of
+            each; None: they are not assessed, except in 20 episodes if a lesson has `success` or `until_return`.
 
     Raises:
         InvalidArgument: for counts or durations that are not positive.
