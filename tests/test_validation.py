@@ -199,6 +199,11 @@ def test_what_the_verdict_says(known: Validation) -> None:
     little = validate(series(x - 3 * later, condition, 2))
     assert little.verdict.startswith("With care: the held-out distribution is off by up to 0.1")
     assert "as responses fell by 7 % meanwhile" in little.verdict
+    # Of the simulators that predict better, the best is recommended.
+    better_hz = {"empirical": 0.2, "memory": 0.1}
+    scores = [replace(s, crps_hz=known.of("histogram").crps_hz - better_hz.get(s.kind, 0.0)) for s in known.scores[1:]]
+    advised = replace(known, kind="histogram", scores=(known.scores[0], *scores))
+    assert advised.verdict == "With care: the empirical simulator predicts better; train with --simulator empirical"
     large = validate(series(x - 12 * later, condition, 2))
     assert large.verdict.startswith("Cannot be trusted: the held-out distribution is off by up to 0.")
     assert large.drift == pytest.approx(np.sqrt(18 / 30 * 48 / 60) - 1, abs=0.03)

@@ -72,6 +72,7 @@ class RobotWithGoal(Robot[GoalState]):
             raise InvalidArgument(f"goal: expected a Goal, or a string for with_goal, got {shown(self.goal)}")
         if len(self._spec) != len(robot.observation_spec):
             raise InvalidArgument(f"goal: expected quantities of different names, {robot.name} has one name twice")
+        # Converted now, so that a wrong quantity or unit is refused.
         _ = self._objectives
         if not is_text(self.goal):
             raise InvalidArgument(
@@ -159,13 +160,13 @@ class RobotWithGoal(Robot[GoalState]):
     ) -> tuple[tuple[Int[Array, ""], ...], Tally, Float[Array, ""], Bool[Array, ""]]:
         """The counts and tally after an iteration, its reward, and whether it ends the episode."""
         margins = self._margins(observation)
-        outside, no = self._outside(margins, outside), jnp.bool_(False)
+        outside, never = self._outside(margins, outside), jnp.bool_(False)
         counts = iter(outside)
         failures, reaches, running = [], [], jnp.float32(0.0)
         for objective, share, margin, inside in zip(self._objectives, self._shares, *margins, strict=True):
-            is_late = no if objective.within is None else next(counts) > objective.within
+            is_late = never if objective.within is None else next(counts) > objective.within
             failures.append(inside if objective.kind == "avoid" else is_late)
-            reaches.append(inside if objective.kind == "reach" else no)
+            reaches.append(inside if objective.kind == "reach" else never)
             worth: Any = {"avoid": 1.0, "reach": 0.0, "drive": inside}.get(objective.kind, (1.0 + margin) / 2)
             running += share / len(self._shares) * worth
         failed, reached = reduce(jnp.logical_or, failures), reduce(jnp.logical_or, reaches)

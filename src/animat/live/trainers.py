@@ -8,7 +8,9 @@ import time
 from collections.abc import Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, wait
 from dataclasses import dataclass, replace
+from math import isnan
 from pathlib import Path
+from statistics import fmean
 from typing import Any, final
 
 import jax
@@ -136,8 +138,9 @@ class Trainers:
 
     @property
     def mean_return(self) -> float:
-        """Mean return of the episodes that ended in the last chunk of a group; NaN if there were none."""
-        return next((report["mean_return"] for report in self._reports.values()), float("nan"))
+        """Mean return of the episodes that ended in the last chunks, averaged over groups; NaN if there were none."""
+        returns = [report["mean_return"] for report in self._reports.values() if not isnan(report["mean_return"])]
+        return fmean(returns) if returns else float("nan")
 
     @property
     def use_the_newest(self) -> bool:

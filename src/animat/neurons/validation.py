@@ -171,7 +171,8 @@ class Validation:
         scores = self.of(self.kind)
         conditions = self.gain("empirical", MARGINAL)
         distance, lag = scores.distance, self.autocorrelation[0] - scores.autocorrelation.mean[0]
-        better = [s.kind for s in self.scores[1:] if self.gain(s.kind, self.kind, "crps_hz").is_certain]
+        gains = {s.kind: self.gain(s.kind, self.kind, "crps_hz") for s in self.scores[1:]}
+        better = max((kind for kind, gain in gains.items() if gain.is_certain), key=gains.__getitem__, default=None)
         off = f"the held-out distribution is off by up to {distance:.3f}"
         drifted = f", as responses {'fell' if self.drift < 0 else 'rose'} by {100 * abs(self.drift):.0f} % meanwhile"
         off += drifted if abs(self.drift) > SMALL_DISTANCE / 2 else ""
@@ -186,14 +187,14 @@ class Validation:
             return f"Cannot be trusted: {off} (at most {LARGE_DISTANCE:g} with care)"
         if distance > SMALL_DISTANCE:
             return f"With care: {off} (at most {SMALL_DISTANCE:g} to be trusted)"
-        if lag != lag:
+        if np.isnan(lag):
             return "With care: successive responses cannot be compared, as no two neighbours are both non-burst"
         if abs(lag) > LARGE_DIFFERENCE:
             both = f"{self.autocorrelation[0]:.2f}, the simulator's by {scores.autocorrelation.mean[0]:.2f}"
             apart = f"at most {LARGE_DIFFERENCE:g} apart to be trusted"
             return f"With care: successive responses correlate by {both} ({apart})"
         if better:
-            return f"With care: the {better[-1]} simulator predicts better; train with --simulator {better[-1]}"
+            return f"With care: the {better} simulator predicts better; train with --simulator {better}"
         return (
             f"Can be trusted: the held-out distribution is off by {distance:.3f} at most, and the condition is worth "
             f"{conditions.value:.3f} +- {conditions.error:.3f} bits per trial"
