@@ -15,6 +15,7 @@ Background spikes are placed everywhere except up to 10 ms after a stimulus: the
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -77,7 +78,7 @@ class SyntheticCulture:
         Args:
             start_min: its start on the culture's clock in minutes, 0 or more.
         """
-        channels, patterns = self._electrodes()
+        channels, patterns = _electrodes(self.seed, self.channels, self.patterns)
         rng = np.random.default_rng([self.seed, 1, round(start_min * 60_000)])
         time_s, frequency, pattern = self._protocol(rng)
         stop_s = float(time_s[-1]) + PAUSE_S
@@ -107,23 +108,6 @@ class SyntheticCulture:
             provenance={"source": SOURCE, "seed": str(self.seed)},
             culture=RecordedCulture("synthetic", self.seed),
         )
-
-    def _electrodes(self) -> tuple[Channels, Int64[np.ndarray, "patterns electrodes"]]:
-        """The recording channels, and the electrodes of each pattern; the same in all recordings."""
-        rng = np.random.default_rng([self.seed, 0])
-        shuffled = rng.permutation(len(MAXONE))
-        electrode, others = shuffled[: self.channels], shuffled[self.channels :]
-        stimulating: list[int] = []
-        for candidate in others.tolist():
-            if all(MAXONE.distance_um(candidate, chosen) > PATTERN_SPACING_UM for chosen in stimulating):
-                stimulating.append(candidate)
-            if len(stimulating) == STIMULATION_ELECTRODES:
-                break
-        patterns: dict[tuple[int, ...], None] = {}
-        while len(patterns) < self.patterns:
-            chosen = rng.choice(stimulating, PATTERN_ELECTRODES, replace=False)
-            patterns[tuple(sorted(chosen.tolist()))] = None
-        return Channels.on(MAXONE, electrode), np.array(list(patterns), dtype=np.int64)
 
     def _protocol(
         self, rng: np.random.Generator
@@ -198,3 +182,24 @@ def write_synthetic_series(
 def _shuffles(rng: np.random.Generator, n: int, channels: int) -> Int64[np.ndarray, "n channels"]:
     """All channels in random order, n times."""
     return np.argsort(rng.random((n, channels)), axis=1)
+
+
+@cache
+def _electrodes(
+    seed: int, n_channels: int, n_patterns: int
+) -> tuple[Channels, Int64[np.ndarray, "patterns electrodes"]]:
+    """The recording channels, and the electrodes of each pattern; the same in all recordings of a culture."""
+    rng = np.random.default_rng([seed, 0])
+    shuffled = rng.permutation(len(MAXONE))
+    electrode, others = shuffled[:n_channels], shuffled[n_channels:]
+    stimulating: list[int] = []
+    for candidate in others.tolist():
+        if all(MAXONE.distance_um(candidate, chosen) > PATTERN_SPACING_UM for chosen in stimulating):
+            stimulating.append(candidate)
+        if len(stimulating) == STIMULATION_ELECTRODES:
+            break
+    patterns: dict[tuple[int, ...], None] = {}
+    while len(patterns) < n_patterns:
+        chosen = rng.choice(stimulating, PATTERN_ELECTRODES, replace=False)
+        patterns[tuple(sorted(chosen.tolist()))] = None
+    return Channels.on(MAXONE, electrode), np.array(list(patterns), dtype=np.int64)

@@ -21,7 +21,6 @@ from animat.cultures.safety import Admitted
 from animat.cultures.series import record_series
 from animat.cultures.shortfalls import shortfall_findings
 from animat.cultures.under_way import UNDER_WAY, PartialRecording
-from animat.cultures.virtual import VirtualCulture
 from animat.errors import DeviceFailed, InvalidFile
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.reading import read_recording, read_recordings
@@ -30,6 +29,7 @@ from animat.recordings.recording import Recording
 from animat.stimulation.protocol import Protocol
 from animat.stimulation.pulse import BALANCED_PULSE
 from animat.stimulation.schedule import make_schedule
+from cultures import small_culture
 from stand_in_cl import Neurons
 from stand_in_cl import install as install_cl
 from stand_in_maxlab import Rig
@@ -340,7 +340,7 @@ def test_a_second_ctrl_c_or_a_kill_loses_nothing(tmp_path: Path, monkeypatch: py
             record_series(lambda: on_maxone(monkeypatch)[0], protocol, killed, sessions=1)
     assert [file.name for file in killed.iterdir()] == [UNDER_WAY]
     # Whatever is recorded there next.
-    record_series(lambda: VirtualCulture(1, scan_s=0.5), Protocol(trials=1), killed, sessions=1)
+    record_series(small_culture, Protocol(trials=1, patterns=8), killed, sessions=1)
     assert not (killed / UNDER_WAY).exists()
     kept, recording = read_recording(killed / "interrupted" / made.name), read_recording(made)
     for name in ("protocol", "culture", "loop_pulse", "presentation", "duration_s", "findings"):
