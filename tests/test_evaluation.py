@@ -261,15 +261,15 @@ def test_simulators_fitted_differently_from_training_are_reported() -> None:
     timeline = timeline_of()
     trained = {"kind": "histogram", "bins": 40, "range_hz": None, "recorded_at_min": [0.0]}
     policy = replace(policy_of(timeline), provenance={"simulators": trained})
-    noticed = evaluate({"a": policy}, timeline, episodes=50).findings
+    noticed = evaluate({"a": policy}, timeline, episodes=50, controls=()).findings
     (finding,) = (each for each in noticed if each.name == "other-simulator")
     assert finding.message.endswith("fitted differently: bins 40, here 20")
     of_memory = replace(policy, provenance={"simulators": trained | {"kind": "memory", "bins": None}})
-    noticed = evaluate({"a": of_memory}, timeline, episodes=50).findings
+    noticed = evaluate({"a": of_memory}, timeline, episodes=50, controls=()).findings
     (finding,) = (each for each in noticed if each.name == "other-simulator")
     assert finding.message.endswith("fitted differently: kind memory, here histogram"), "a memory has no bins"
     alike = replace(policy, provenance={"simulators": trained | {"bins": 20}})
-    noticed = evaluate({"a": alike}, timeline, episodes=50).findings
+    noticed = evaluate({"a": alike}, timeline, episodes=50, controls=()).findings
     assert "other-simulator" not in {each.name for each in noticed}
 
 
@@ -452,7 +452,7 @@ def test_mismatches_are_refused() -> None:
 def test_differences_of_any_policy_are_reported_once() -> None:
     timeline = timeline_of()
     alike, other = policy_of(timeline), replace(policy_of(timeline), presentation=Presentation("mixed", 5))
-    run = partial(evaluate, timeline=timeline, episodes=2, controls=())
+    run = partial(evaluate, timeline=timeline, episodes=50, controls=())
     expected = [*run({"a": alike}).findings, *run({"b": other}).findings]
     assert {finding.name for finding in expected} == {"other-presentation", "other-calibration"}
     assert list(run({"a": alike, "b": other, "c": other}).findings) == expected

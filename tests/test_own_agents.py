@@ -389,10 +389,10 @@ def test_ctrl_c_is_not_held_until_the_last_episode(is_on_host: bool, in_the_fore
             return int(rng.integers(5))
 
     timeline = five_conditions()
-    policy = slider_of(timeline) if is_on_host else policy_of(timeline)
+    policy = slider_of(timeline) if is_on_host else policy_of(timeline, Cartpole(episode_limit=60))
     with pytest.raises(KeyboardInterrupt):
-        evaluate({"p0": policy}, timeline, episodes=100, controls=[], agents={"slow": Slow()})
-    # Of some thousand.
+        evaluate({"p0": policy}, timeline, episodes=40, controls=[], agents={"slow": Slow()})
+    # Of about a thousand.
     assert asked < 200
 
 
@@ -450,14 +450,14 @@ def test_an_agent_is_asked_in_each_iteration_of_its_episodes_and_its_first_answe
             return int(rng.integers(5))
 
     timeline = five_conditions()
-    policies = {"p0": slider_of(timeline) if is_on_host else policy_of(timeline, Cartpole(episode_limit=40))}
-    row = evaluate(policies, timeline, episodes=4, controls=[], agents={"it": Counted()}).rows[1]
+    policies = {"p0": slider_of(timeline) if is_on_host else policy_of(timeline, Cartpole(episode_limit=60))}
+    row = evaluate(policies, timeline, episodes=40, controls=[], agents={"it": Counted()}).rows[1]
     lengths = row.episodes.lengths.ravel()
     assert np.ptp(lengths) > 0 or is_on_host
     # In JAX it is tried once before.
     assert asked == lengths.sum() + min(20, lengths[0]) + (not is_on_host)
     with pytest.raises(InvalidArgument, match=r"agents: mine: act: expected one condition for .*, got 0, then 4: draw"):
-        evaluate(policies, timeline, episodes=4, controls=[], agents={"mine": Counting()})
+        evaluate(policies, timeline, episodes=40, controls=[], agents={"mine": Counting()})
 
 
 class OnlyBegins:
@@ -469,10 +469,10 @@ def test_an_agent_may_have_begin_alone(tmp_path: Path) -> None:
     timeline = five_conditions()
     policies = {"p0": policy_of(timeline, Cartpole(episode_limit=30))}
     agents = {"begins": OnlyBegins(), "plain": Plain()}
-    found = evaluate(policies, timeline, episodes=5, controls=[], agents=agents)
+    found = evaluate(policies, timeline, episodes=3, controls=[], agents=agents)
     assert found.rows[1].episodes.returns.tolist() == found.rows[2].episodes.returns.tolist()
     with pytest.raises(InvalidArgument, match=r"agents: expected a name for each, got ''"):
-        evaluate(policies, timeline, episodes=5, controls=[], agents={"": Plain()})
+        evaluate(policies, timeline, episodes=3, controls=[], agents={"": Plain()})
 
 
 def test_ctrl_c_ends_an_evaluation_whose_agent_hangs(in_the_foreground: None) -> None:
