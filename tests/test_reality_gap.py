@@ -84,6 +84,14 @@ def series(recordings: list[Recording]) -> list[Responses]:
     return [extract_responses(recording, burst_threshold=0.95) for recording in recordings]
 
 
+@pytest.fixture(scope="module")
+def calibration(series: list[Responses]) -> Calibration:
+    """From few bootstraps, for tests of what else a closed loop says and does."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("animat.reality_gap.calibration.BOOTSTRAPS", 4)
+        return Calibration.of_series(series)
+
+
 def policy_of(seed: int, series: list[Responses], robot: Robot[Any] | None = None, **changed: Any) -> Policy:
     rng = np.random.default_rng(seed)
     robot = robot or Navigation(episode_limit=8)
@@ -272,8 +280,9 @@ def test_the_table_holds_what_the_simulator_and_the_session_say(
 
 @pytest.mark.oracle
 @pytest.mark.usefixtures("few_bootstraps")
-def test_with_few_responses_to_a_condition_there_is_no_optimal_return(tmp_path: Path, series: list[Responses]) -> None:
-    calibration = Calibration.of_series(series)
+def test_with_few_responses_to_a_condition_there_is_no_optimal_return(
+    tmp_path: Path, series: list[Responses], calibration: Calibration
+) -> None:
     of_each = calibration.responses_hz
     few = replace(calibration, adjusted=replace(calibration.adjusted, responses_hz=(*of_each[:4], of_each[4][:3])))
     with FakeCulture() as culture:
@@ -287,7 +296,7 @@ def test_with_few_responses_to_a_condition_there_is_no_optimal_return(tmp_path: 
 
 @pytest.mark.usefixtures("few_bootstraps")
 def test_the_optimal_return_is_computed_before_the_session_and_so_known_where_the_budget_ends_it(
-    tmp_path: Path, series: list[Responses], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, series: list[Responses], calibration: Calibration, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A program that exits while it is computed is killed by a signal."""
 
@@ -297,7 +306,7 @@ def test_the_optimal_return_is_computed_before_the_session_and_so_known_where_th
 
     monkeypatch.setattr("animat.reality_gap.running.optimal_values", before)
     with FakeCulture() as culture:
-        of = {"p0": policy_of(0, series)}, culture, Calibration.of_series(series)
+        of = {"p0": policy_of(0, series)}, culture, calibration
         gap = run_policies(*of, tmp_path, episodes=1, with_controls=False, account=Account(Budget(pulses=0)))
     assert (gap.session.ending.by, gap.optimum) == ("budget", 12.5)
 
@@ -305,14 +314,14 @@ def test_the_optimal_return_is_computed_before_the_session_and_so_known_where_th
 @pytest.mark.oracle
 @pytest.mark.usefixtures("few_bootstraps")
 def test_a_session_goes_on_and_says_why_if_the_optimal_return_fails(
-    tmp_path: Path, series: list[Responses], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, series: list[Responses], calibration: Calibration, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(*_: Any, **__: Any) -> Any:
         raise MemoryError("no room")
 
     monkeypatch.setattr("animat.reality_gap.running.optimal_values", fail)
     with FakeCulture() as culture:
-        of = {"p0": policy_of(0, series)}, culture, Calibration.of_series(series)
+        of = {"p0": policy_of(0, series)}, culture, calibration
         gap = run_policies(*of, tmp_path, episodes=1, with_controls=False)
     assert (gap.session.ending.by, gap.optimum) == ("plan", None)
     assert "no optimal return: MemoryError: no room" in gap.to_text()
@@ -390,8 +399,10 @@ def test_responses_to_policies_agree_with_the_log_and_the_adaptive_median(withou
 
 
 @pytest.mark.usefixtures("few_bootstraps")
-def test_drift_is_foreseen_from_the_start_of_the_session_on(without_controls: Ran, series: list[Responses]) -> None:
-    gap, drift = without_controls[0], Calibration.of_series(series).drift
+def test_drift_is_foreseen_from_the_start_of_the_session_on(
+    without_controls: Ran, series: list[Responses], calibration: Calibration
+) -> None:
+    gap, drift = without_controls[0], calibration.drift
     assert drift is not None and np.all(np.isfinite(drift.minutes_to(LARGE)))
     # The culture of these tests starts afresh.
     since_min = max(0.0, gap.session.log.header["start_min"] - series[-1].start_min)
@@ -548,14 +559,13 @@ def test_of_an_interrupted_live_training_the_policy_that_met_the_newest_recordin
 
 
 def test_what_the_loop_refuses_is_refused_before_anything_is_predicted(
-    series: list[Responses], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    series: list[Responses], calibration: Calibration, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def predict_agents(*_: object, **__: object) -> None:
         raise AssertionError("predicted")
 
     monkeypatch.setattr("animat.reality_gap.running.predict_agents", predict_agents)
     elsewhere = replace(series[0].conditions[0], electrodes=((99_999,),))
-    calibration = Calibration.of_series(series)
     calibration = replace(calibration, conditions=(elsewhere, *calibration.conditions[1:]))
     policy = policy_of(0, series, conditions=calibration.conditions)
     with FakeCulture() as culture, pytest.raises(Mismatch, match=r"can stimulate .*, got 99999: run on the culture"):
@@ -636,7 +646,7 @@ def test_intervals_of_the_gap_cover_the_truth_as_often_as_they_say(
     assert 106 <= covered <= 119
 
 
-@pytest.mark.parametrize("episodes", [2, 5])
+@pytest.mark.parametrize("episodes", [2, pytest.param(5, marks=pytest.mark.oracle)])
 def test_few_episodes_give_intervals_as_wide_as_they_have_to_be(episodes: int) -> None:
     """Without an error of the prediction."""
     rng, covered = np.random.default_rng(6), 0
@@ -746,11 +756,11 @@ def test_episodes_with_the_same_start_count_together() -> None:
 @pytest.mark.parametrize("robot", [Shuttle(episode_limit=5), Cartpole(episode_limit=5)])
 @pytest.mark.usefixtures("few_bootstraps")
 def test_rows_know_which_episodes_have_the_same_start(
-    tmp_path: Path, series: list[Responses], robot: Robot[Any]
+    tmp_path: Path, series: list[Responses], calibration: Calibration, robot: Robot[Any]
 ) -> None:
     policies = {f"p{i}": policy_of(i, series, robot=robot) for i in range(2)}
     with FakeCulture() as culture:
-        gap = run_policies(policies, culture, Calibration.of_series(series), tmp_path / "s", episodes=3)
+        gap = run_policies(policies, culture, calibration, tmp_path / "s", episodes=3)
     turns = [None if row.turn is None else row.turn.tolist() for row in gap.rows[:3]]
     # Agents take turns in a new order each round; the cartpole has one start only.
     assert turns == ([None] * 3 if isinstance(robot, Cartpole) else [[0, 0, 1, 1, 2, 2], [0, 1, 2], [0, 1, 2]])
@@ -793,13 +803,12 @@ def test_a_loop_delivers_what_its_recording_was_made_with(
 
 @pytest.mark.usefixtures("few_bootstraps")
 def test_another_culture_than_the_recorded_one_is_noticed_from_python_too(
-    tmp_path: Path, series: list[Responses]
+    tmp_path: Path, series: list[Responses], calibration: Calibration
 ) -> None:
     recording = series[1].recording
     assert recording is not None and not len(recording.spike_times_s) and len(recording.stimuli.time_s)
     stimuli = replace(recording.stimuli, electrodes=recording.stimuli.electrodes[:, :1])
     channels = replace(recording.channels, electrode=recording.channels.electrode + 1)
-    calibration = Calibration.of_series(series)
     found = []
     for of in (recording, replace(recording, stimuli=stimuli, channels=channels)):
         with FakeCulture() as culture:
@@ -811,13 +820,15 @@ def test_another_culture_than_the_recorded_one_is_noticed_from_python_too(
 
 
 @pytest.mark.usefixtures("few_bootstraps")
-def test_a_table_that_cannot_be_written_is_still_returned(tmp_path: Path, series: list[Responses]) -> None:
+def test_a_table_that_cannot_be_written_is_still_returned(
+    tmp_path: Path, series: list[Responses], calibration: Calibration
+) -> None:
     (tmp_path / "s" / "returns.txt").mkdir(parents=True)
     with FakeCulture() as culture:
         gap = run_policies(
             {"p0": policy_of(0, series)},
             culture,
-            Calibration.of_series(series),
+            calibration,
             tmp_path / "s",
             episodes=1,
             with_controls=False,
@@ -826,10 +837,11 @@ def test_a_table_that_cannot_be_written_is_still_returned(tmp_path: Path, series
 
 
 @pytest.mark.usefixtures("few_bootstraps")
-def test_returns_are_predicted_from_the_starts_of_the_session(tmp_path: Path, series: list[Responses]) -> None:
+def test_returns_are_predicted_from_the_starts_of_the_session(
+    tmp_path: Path, series: list[Responses], calibration: Calibration
+) -> None:
     """Of navigation with drawn starts, as far as a robot that always starts where an episode did returns."""
     policies = {f"p{i}": policy_of(i, series, robot=Anywhere()) for i in range(2)}
-    calibration = Calibration.of_series(series)
     with FakeCulture() as culture:
         gap = run_policies(policies, culture, calibration, tmp_path / "s", episodes=3, with_controls=False)
     together, *rows = gap.rows
@@ -855,9 +867,10 @@ def test_returns_are_predicted_from_the_starts_of_the_session(tmp_path: Path, se
 
 @pytest.mark.oracle
 @pytest.mark.usefixtures("few_bootstraps")
-def test_an_ended_session_is_compared_with_the_starts_that_it_had(tmp_path: Path, series: list[Responses]) -> None:
+def test_an_ended_session_is_compared_with_the_starts_that_it_had(
+    tmp_path: Path, series: list[Responses], calibration: Calibration
+) -> None:
     policies = {"p0": policy_of(0, series, robot=Anywhere())}
-    calibration = Calibration.of_series(series)
     found = []
     for budget in (Budget(), Budget(pulses=60)):
         with FakeCulture() as culture:
@@ -907,9 +920,11 @@ def test_rounding_is_no_gap() -> None:
 
 @pytest.mark.oracle
 @pytest.mark.usefixtures("few_bootstraps")
-def test_the_range_is_that_from_the_starts_of_all_rounds(tmp_path: Path, series: list[Responses]) -> None:
+def test_the_range_is_that_from_the_starts_of_all_rounds(
+    tmp_path: Path, series: list[Responses], calibration: Calibration
+) -> None:
     """A single policy has more rounds than the random control, which is predicted from all the same."""
-    policies, calibration = {"p0": policy_of(0, series, robot=Shuttle(episode_limit=5))}, Calibration.of_series(series)
+    policies = {"p0": policy_of(0, series, robot=Shuttle(episode_limit=5))}
     with FakeCulture() as culture:
         gap = run_policies(policies, culture, calibration, tmp_path / "s", episodes=8)
         with pytest.raises(InvalidArgument, match="seed: expected 0 or more, got -1"):
@@ -961,8 +976,8 @@ def test_a_prediction_is_more_certain_with_more_recorded_responses() -> None:
 
 
 @pytest.mark.usefixtures("few_bootstraps")
-def test_the_heuristic_policy_is_the_same_on_simulator_and_culture(series: list[Responses]) -> None:
-    simulator = Calibration.of_series(series).simulator
+def test_the_heuristic_policy_is_the_same_on_simulator_and_culture(calibration: Calibration) -> None:
+    simulator = calibration.simulator
     rng = np.random.default_rng(1)
     for robot, low, high in (
         (Cartpole(), [-0.5, -2, -0.2, -3], [0.5, 2, 0.2, 3]),
@@ -1062,11 +1077,10 @@ def test_the_percentiles_are_those_of_the_last_simulator_in_training(series: lis
 @pytest.mark.usefixtures("few_bootstraps")
 @pytest.mark.parametrize(("rest_min", "warned"), [pytest.param(20.0, False, marks=pytest.mark.oracle), (45.0, True)])
 def test_a_recording_much_older_than_the_culture_is_reported(
-    tmp_path: Path, series: list[Responses], rest_min: float, warned: bool
+    tmp_path: Path, series: list[Responses], calibration: Calibration, rest_min: float, warned: bool
 ) -> None:
     with FakeCulture() as culture:
         culture.rest(rest_min * 60)
-        calibration = Calibration.of_series(series)
         age_min = culture.now_s / 60 - calibration.start_min
         gap = run_policies(
             {"p0": policy_of(0, series)}, culture, calibration, tmp_path, episodes=1, with_controls=False
@@ -1101,8 +1115,9 @@ def test_on_a_device_whose_clock_started_anew_a_recordings_date_tells_its_age(
 
 
 @pytest.mark.usefixtures("few_bootstraps")
-def test_policies_that_do_not_belong_together_are_refused(tmp_path: Path, series: list[Responses]) -> None:
-    calibration = Calibration.of_series(series)
+def test_policies_that_do_not_belong_together_are_refused(
+    tmp_path: Path, series: list[Responses], calibration: Calibration
+) -> None:
     one, other = policy_of(0, series), policy_of(0, series, presentation=Presentation("mixed", 5))
     with FakeCulture() as culture:
         with pytest.raises(InvalidArgument, match="at least one"):
