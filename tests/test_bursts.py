@@ -146,7 +146,7 @@ BETAS = ((1, 1), (2, 2), (2, 5), (1.2, 8), (5, 2), (0.9, 4), (1, 20), (3, 60), (
 LOGNORMALS = ((0.05, 0.5), (0.05, 1.0), (0.1, 0.8), (0.02, 1.2), (0.2, 0.6), (0.01, 1.5))
 
 
-@pytest.mark.parametrize("n", [60, 500])
+@pytest.mark.parametrize("n", [60, pytest.param(500, marks=pytest.mark.oracle)])
 def test_what_has_one_peak_is_hardly_ever_cut(n: int) -> None:
     rng = np.random.default_rng(n)
     cut: dict[str, list[float]] = {}

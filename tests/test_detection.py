@@ -92,7 +92,7 @@ def test_known_spikes_are_found_and_few_others(known: tuple[RawTraces, list[Int6
     assert np.all(np.diff(found.time_s) >= 0)
 
 
-@pytest.mark.parametrize(("chunk_s", "workers"), [(0.1, 1), (0.3, 3), (10.0, 2)])
+@pytest.mark.parametrize(("chunk_s", "workers"), [(0.1, 1), (0.3, 3), pytest.param(10.0, 2, marks=pytest.mark.oracle)])
 def test_the_size_of_pieces_and_the_number_of_threads_change_nothing(
     known: tuple[RawTraces, list[Int64[np.ndarray, " n"]]], found_in_known: DetectedSpikes, chunk_s: float, workers: int
 ) -> None:

@@ -47,7 +47,7 @@ class Drawn(Robot[Any]):
         return state[None]
 
 
-@pytest.mark.parametrize("episodes", [7, 70])
+@pytest.mark.parametrize("episodes", [pytest.param(7, marks=pytest.mark.oracle), 70])
 def test_episodes_start_where_those_of_a_session_will(episodes: int) -> None:
     """70 do not run side by side on the host. The loop's own runner is what says where it starts."""
     starts = Starts.of_session(5, 3)

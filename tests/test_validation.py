@@ -225,7 +225,7 @@ def test_what_the_verdict_says(known: Validation) -> None:
         validate(chain, kind="none")
 
 
-@pytest.mark.parametrize("share", [0.0, 0.05])
+@pytest.mark.parametrize("share", [0.0, pytest.param(0.05, marks=pytest.mark.oracle)])
 def test_a_culture_that_hardly_answers_is_not_trusted(share: float) -> None:
     rng = np.random.default_rng(6)
     v = validate(series(1.0 * (rng.random(1_000) < share), np.arange(1_000) % 2, 2))
@@ -620,7 +620,11 @@ def test_the_figure_names_its_axes(known: Validation) -> None:
 
 @pytest.mark.parametrize(
     "name",
-    ["known.npz", "cost$_{a$.npz", "culture 12, day 42 in vitro, mixed, by the second operator, again.nwb"],
+    [
+        pytest.param("known.npz", marks=pytest.mark.oracle),
+        "cost$_{a$.npz",
+        "culture 12, day 42 in vitro, mixed, by the second operator, again.nwb",
+    ],
 )
 def test_the_figure_has_the_whole_name_of_its_file(known: Validation, name: str) -> None:
     """Two dollar signs were a formula, which ended in a traceback, and long names were cut off at both ends."""
