@@ -370,8 +370,13 @@ def test_pulses_in_quick_succession_and_at_the_ends_are_only_blanked() -> None:
     assert np.all((found.time_s >= 0) & (found.time_s <= 0.5))
 
 
-@pytest.mark.parametrize("until_ms", [15.0, 100.0, 700.0])
-@pytest.mark.parametrize("chunk_s", [0.2, 0.5])
+@pytest.mark.parametrize(
+    ("until_ms", "chunk_s"),
+    [
+        *((15.0, 0.2), (100.0, 0.5), (700.0, 0.2)),
+        *(pytest.param(*each, marks=pytest.mark.oracle) for each in ((15.0, 0.5), (100.0, 0.2), (700.0, 0.5))),
+    ],
+)
 def test_who_is_saturated_for_long_is_blanked_to_its_end(until_ms: float, chunk_s: float) -> None:
     voltage, truth = noisy(6, 16.0)
     # The fourth comes while the third still saturates the channel, where that lasts 100 ms.

@@ -113,7 +113,7 @@ def test_a_long_block_is_recorded_in_stretches_and_the_clock_keeps_count(
         assert f"lacks: {2000 * between_s:.0f} ms between stretches" in found["left-out"].message
 
 
-@pytest.mark.parametrize("device", [on_cl1, on_maxone])
+@pytest.mark.parametrize("device", [on_cl1, pytest.param(on_maxone, marks=pytest.mark.oracle)])
 @pytest.mark.parametrize(
     "error", [KeyboardInterrupt, pytest.param(RuntimeError("a broken cable"), marks=pytest.mark.oracle)]
 )

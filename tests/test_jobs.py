@@ -220,6 +220,7 @@ def test_the_first_that_fails_ends_all_and_a_lent_executor_is_waited_for(tmp_pat
     assert Jobs([joined("runs")], tmp_path, tmp_path / "jobs", "study").waiting == []
 
 
+@pytest.mark.oracle
 def test_ours_end_at_once_where_one_fails(tmp_path: Path) -> None:
     jobs = [Job("fails", Fail(), cost_s=9.0), joined("runs", takes_s=600.0)]
     with pytest.raises(InvalidFile, match="fails: a"):
