@@ -224,8 +224,7 @@ TRIVIAL = SAC(
 )  # fmt: skip
 
 
-@pytest.mark.oracle
-@pytest.mark.parametrize("commands", [(-0.8, 0.0, 0.8), None])
+@pytest.mark.parametrize("commands", [(-0.8, 0.0, 0.8), pytest.param(None, marks=pytest.mark.oracle)])
 def test_a_trivial_task_is_learned(commands: tuple[float, ...] | None) -> None:
     environment = WithoutNeurons(Follower(), commands)
     learner, _ = trained_for(environment, TRIVIAL, 1500)
