@@ -355,8 +355,7 @@ def trajectories(
     """Run episodes of each actor on a robot in JAX; arguments as in `roll_out`."""
     n_actors = actors.n_actors
     keys = jax.random.split(jax.random.key(seed), n_actors * episodes).reshape(n_actors, episodes)
-    ran: Trajectories = jax.device_get(_trajectories(environment, simulator, actors, keys))
-    return ran
+    return jax.device_get(_trajectories(environment, simulator, actors, keys))  # type: ignore[no-any-return]
 
 
 @partial(jax.jit, static_argnums=0)

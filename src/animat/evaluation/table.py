@@ -193,11 +193,9 @@ class _World:
 
     def row_of(self, control: Control, *, episodes: int, seed: int) -> EvaluationRow:
         ran = control.run(self.environment, self.simulator, episodes=episodes, seed=seed)
-        of_trials = self.pulses_of_trials
+        of_trials, changed = self.pulses_of_trials, control.delivery != "chosen"
         pulses = None if of_trials is None else ran.presented @ of_trials * (control.delivery != "silent") / episodes
-        return EvaluationRow(
-            control.name, control.meaning, ran, control.delivery != "chosen", pulses, self.first.pulse_cost
-        )
+        return EvaluationRow(control.name, control.meaning, ran, changed, pulses, self.first.pulse_cost)
 
     def optimum(self, resolution: float, seed: int, progress: Progress) -> Optimum:
         """The optimal return; if responses are known, with its interval and without conditions with few responses."""
