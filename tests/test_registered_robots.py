@@ -309,6 +309,7 @@ def test_a_return_beyond_what_a_robot_states_is_reported_before_training(
     [
         ("my_nowhere:Rover", "expected my_nowhere:Rover to be importable, got ModuleNotFoundError"),
         ("my_package.robots:Tank", "Tank to be importable, got AttributeError"),
+        ("my_package.robots:Tank-v0", "a Gymnasium environment is gymnasium:my_package.robots:Tank-v0$"),
         ("my_package.robots:At", "expected a subclass of animat.Robot, got <class"),
         ("my_package.robots:", "to be importable, got "),
         (":Rover", "to be importable, got ValueError"),

@@ -264,8 +264,9 @@ def imported(noun: str, place: str) -> Any:
     except InvalidArgument:
         raise
     except (Exception, SystemExit) as error:
-        # Anything may go wrong in a third-party module.
-        raise InvalidArgument(f"{noun}: expected {place} to be importable, got {first_line(error)}") from error
+        # Anything may go wrong in a third-party module. The name of a class has no hyphen.
+        hint = f"; a Gymnasium environment is gymnasium:{place}" if re.search(r"-v\d+$", name) else ""
+        raise InvalidArgument(f"{noun}: expected {place} to be importable, got {first_line(error)}{hint}") from error
 
 
 def place_of(kind: type) -> str:
