@@ -63,6 +63,21 @@ def test_gymnasiums_checker_passes_without_a_warning(id_: str, options: dict) ->
 
 
 @pytest.mark.oracle
+def test_stable_baselines3_trains_on_it() -> None:
+    library = pytest.importorskip("stable_baselines3", reason="stable-baselines3 is not installed")
+    from stable_baselines3.common.env_checker import check_env as check
+
+    environment = gymnasium.make("Animat/Cartpole-v0", mapping="9-thresholds")
+    check(environment)
+    agent = library.DQN("MlpPolicy", environment, learning_starts=50, seed=1, device="cpu").learn(300)
+    assert agent.num_timesteps == 300
+    episodes = agent.ep_info_buffer
+    assert len(episodes) > 1 and all(0 < each["l"] <= 120 and -100 <= each["r"] <= 120 for each in episodes)
+    action, _ = agent.predict(environment.reset(seed=1)[0], deterministic=True)
+    assert environment.action_space.contains(int(action))
+
+
+@pytest.mark.oracle
 @pytest.mark.parametrize(
     "imports",
     [
