@@ -106,6 +106,7 @@ def _try_lock(lock: IO[str]) -> bool:
     except BlockingIOError:
         return False
     except OSError:
+        # The file system has no locks: see `_holding`.
         pass
     return True
 

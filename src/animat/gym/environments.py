@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cached_property, lru_cache, partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium
 import jax
@@ -31,6 +31,15 @@ Observations = Float32[np.ndarray, "environments observations"]
 Actions = Int64[np.ndarray, " environments"]
 Rewards = Float32[np.ndarray, " environments"]
 Flags = Bool[np.ndarray, " environments"]
+
+
+class _Functions(NamedTuple):
+    """Of an environment, compiled: starts and steps, as rows; what is in rows; what episodes achieved of a goal."""
+
+    start: Callable[..., Any]
+    step: Callable[..., Any]
+    read: Callable[[Rows], tuple[Any, Observations]]
+    judge: Callable[..., Any] | None
 
 
 class CompiledAnimats:
@@ -74,22 +83,19 @@ class CompiledAnimats:
 
     def _start(self, rng: np.random.Generator) -> Rows:
         """Rows of new episodes."""
-        start, *_ = self._functions
-        return np.asarray(start(rng.integers(0, 2**32, len(self._shown), dtype=np.uint32)))
+        return np.asarray(self._functions.start(rng.integers(0, 2**32, len(self._shown), dtype=np.uint32)))
 
     def _step(self, rows: Rows, actions: Actions, rng: np.random.Generator) -> Rows:
         """Rows after an iteration of each."""
-        _, step, *_ = self._functions
         n, noise_size = len(rows), self.setup.environment.noise_size
         inputs = np.empty((n, 1 + noise_size), np.float32)
         inputs[:, 0] = actions
         inputs[:, 1:] = rng.random((n, noise_size), np.float32)
-        return np.asarray(step(inputs, rows, self.setup.simulator))
+        return np.asarray(self._functions.step(inputs, rows, self.setup.simulator))
 
     def _go_on_from(self, rows: Rows, begun: Flags) -> tuple[Any, Observations]:
         """Returns the `State` and the observations in the rows, as numpy copies, shape (environments, ...)."""
-        _, _, read, _ = self._functions
-        self._rows, (state, observations) = rows, read(rows)
+        self._rows, (state, observations) = rows, self._functions.read(rows)
         if self.render_mode is not None:
             self._commands = state.info["command"]
             # Copies, as the observations belong to the user.
@@ -100,7 +106,7 @@ class CompiledAnimats:
 
     def _outcomes(self, after: State) -> dict[str, Any]:
         """What each episode that ended achieved of the robot's goal; empty without a goal, and if none ended."""
-        *_, judge = self._functions
+        judge = self._functions.judge
         if judge is None or not np.logical_or(*after.ended).any():
             return {}
         outcome = jax.device_get(judge(after.robot))
@@ -118,13 +124,12 @@ class CompiledAnimats:
         )
 
     @cached_property
-    def _functions(self) -> tuple[Any, ...]:
+    def _functions(self) -> _Functions:
         return _compiled(self.setup.environment)
 
 
 @lru_cache(maxsize=64)
-def _compiled(environment: Environment[Any]) -> tuple[Any, ...]:
-    """Starts and steps, as rows, the reading of rows, and the outcome of episodes, if the robot has a goal."""
+def _compiled(environment: Environment[Any]) -> _Functions:
 
     def with_observation(state: State) -> tuple[State, Array]:
         return state, environment.observe(state)
@@ -160,7 +165,7 @@ def _compiled(environment: Environment[Any]) -> tuple[Any, ...]:
     robot = environment.robot
     judge = jax.jit(jax.vmap(robot.outcome)) if isinstance(robot, RobotWithGoal) else None
     read = partial(unpack, as_kind=np.ndarray.view)
-    return jax.jit(jax.vmap(start)), jax.jit(jax.vmap(step, (0, 0, None))), read, judge
+    return _Functions(jax.jit(jax.vmap(start)), jax.jit(jax.vmap(step, (0, 0, None))), read, judge)
 
 
 class AnimatEnv(CompiledAnimats, gymnasium.Env[Float32[np.ndarray, " observations"], np.int64]):
