@@ -155,19 +155,20 @@ def fit_memory(responses: Responses, *, room: int | None = None, memory: Memory 
         left[condition, : len(rows)] = trace_increment(ranked.rank[in_order], ranked.means[condition], memory)
     followers = np.array([len(rows) for rows in ranked.rows])
     return MemorySimulator(
-        values.values_hz,
-        values.counts,
-        values.percentiles,
-        to_jax(before),
-        to_jax(histories),
-        to_jax(after),
-        to_jax(left),
-        to_jax(followers, np.int32),
-        to_jax(np.rint(followers**memory.neighbour_exponent), np.int32),
-        to_jax(toward),
-        to_jax(load.kept),
-        *map(to_jax, (load.added, *memory)),  # type: ignore[misc]
+        values_hz=values.values_hz,
+        counts=values.counts,
+        percentiles=values.percentiles,
+        before=to_jax(before),
+        histories=to_jax(histories),
+        after_hz=to_jax(after),
+        left=to_jax(left),
+        followers=to_jax(followers, np.int32),
+        nearest=to_jax(np.rint(followers**memory.neighbour_exponent), np.int32),
+        toward=to_jax(toward),
+        kept=to_jax(load.kept),
+        added=to_jax(load.added),
         rests=to_jax(ranked.rests, np.bool_),
+        **{name: to_jax(value) for name, value in memory._asdict().items()},
     )
 
 
