@@ -64,6 +64,14 @@ PULSES = 5 * 40 * 2
 QUICK = Timetable(interval_min=10, duration_min=30, speed=1e6)
 
 
+def test_the_return_of_a_live_run_is_that_of_all_groups(tmp_path: Path) -> None:
+    trainers, none = Trainers([], tmp_path, tmp_path), float("nan")
+    assert np.isnan(trainers.mean_return)
+    for returns, mean in (([2.0, none, 5.0], 3.5), ([none], none)):
+        trainers._reports = {i: {"mean_return": of} for i, of in enumerate(returns)}  # type: ignore[misc]
+        assert trainers.mean_return == pytest.approx(mean, nan_ok=True)
+
+
 def lines(folder: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in (folder / LOG_FILE).read_text().splitlines()]
 

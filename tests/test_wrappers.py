@@ -267,3 +267,6 @@ def test_an_animat_has_as_many_conditions_as_its_simulator(n_conditions: int) ->
     simulator, state = timeline_of().at(0.0), animat.reset(jax.random.key(0))
     with pytest.raises(InvalidArgument, match=f"n_conditions: expected 3, those of the simulator, got {n_conditions}"):
         animat.step(jax.random.key(1), state, jnp.int32(0), simulator)
+    for none in (0, -n_conditions):
+        with pytest.raises(InvalidArgument, match=f"n_conditions: expected at least 1, got {none}"):
+            Animat(Cartpole(), Thresholds(9), none)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -37,10 +38,13 @@ class TuneFile(JobOptions):
             tuned = tune(tuning, self.out, base=self.specification.parent, **execution)
         cells = []
         names = ("own settings", "defaults")[: len(first_settings(tuning.study, tuning.space))]
+        errors = [each.standard_error for each in tuned.finals if each.standard_error]
+        # The smallest standard error has two digits.
+        decimals = max(1, 1 - math.floor(math.log10(min(errors)))) if errors else 1
         for final in sorted(tuned.finals, key=lambda each: -each.mean):
-            error = "" if final.standard_error is None else f"{final.standard_error:.1f}"
+            error = "" if final.standard_error is None else f"{final.standard_error:.{decimals}f}"
             name = names[final.trial] if final.trial < len(names) else f"trial {final.trial}"
-            mean = "diverged" if final.returns is None else f"{final.mean:.1f}"
+            mean = "diverged" if final.returns is None else f"{final.mean:.{decimals}f}"
             cells.append([name, mean, error, describe_settings(final.settings)])
         policies, episodes = counted(tuning.study.policies, "policy", "policies"), tuning.study.episodes
         print(f"retrained, {policies} of each, in {episodes} fresh episodes per policy:")

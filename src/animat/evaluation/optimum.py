@@ -154,7 +154,7 @@ def best_returns(
         grid: over the robot's states; None: `grid_of_optimum(robot)`.
         resolution: factor for the steps of the grid along each axis; 0.6 is fast and coarse.
         episodes: of the controller; 0: it is not run, which is faster.
-        seed: of these episodes.
+        seed: decides every random draw.
         progress: updated as the returns of all cases are computed.
 
     Raises:

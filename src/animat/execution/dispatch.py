@@ -288,9 +288,11 @@ class Dispatch:
         batch.place.stored.update(*(call.reads for call in batch.calls))
         # A large answer arrives only with the whole batch.
         if message["number"] == batch.answered and message["answer"] is not None:
+            # One that cannot be read arrives with the whole batch again, which then fails.
+            answer = pickle.loads(message["answer"])
             batch.answered += 1
             call = batch.calls[message["number"]]
-            self._answer(call, pickle.loads(message["answer"]))
+            self._answer(call, answer)
             if not call.future.done():
                 self._waiting.appendleft(call)
 

@@ -208,8 +208,8 @@ def conditions_named(text: str) -> Conditions:
 
     - `all`: one condition;
     - `frequency`: by the stated frequency of the stimulus; `frequency:5,10`: only 5 and 10 Hz;
-    - `interval:5,10`: by the time since the pulse before, within 25 % of 1/5 or 1/10 s; `interval:5,10+-10%`: within
-      10 %;
+    - `interval:5,10`: by the time since the pulse before, if it is 1/5 or 1/10 s within a factor of 1.25;
+      `interval:5,10+-10%`: of 1.1;
     - `electrode`: by the set of stimulated electrodes; `electrode:23275,909+23923`: electrode 23275, or 909 and 23923;
     - `pattern`: by the number of the pattern; `pattern:0,3`: only 0 and 3;
     - `frequency:5,80 x pattern:0,3`: products of frequency or interval with electrode or pattern.
