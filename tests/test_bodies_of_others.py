@@ -313,7 +313,7 @@ def test_versions_of_all_packages_behind_a_body_are_reported() -> None:
 
 def test_a_module_that_is_not_installed_is_named(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     for id, words in (
-        ("my_package.envs:Rover-v0", "ModuleNotFoundError: No module named 'my_package'"),
+        ("no_such_package.envs:Rover-v0", "ModuleNotFoundError: No module named 'no_such_package'"),
         ("Pendulum-v99", "Pendulum-v99"),
         ("", "expected gymnasium: and an environment's id"),
     ):
