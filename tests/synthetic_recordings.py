@@ -202,4 +202,7 @@ def _electrodes(
     while len(patterns) < n_patterns:
         chosen = rng.choice(stimulating, PATTERN_ELECTRODES, replace=False)
         patterns[tuple(sorted(chosen.tolist()))] = None
-    return Channels.on(MAXONE, electrode), np.array(list(patterns), dtype=np.int64)
+    of_patterns = np.array(list(patterns), dtype=np.int64)
+    # All who ask have the same one.
+    of_patterns.setflags(write=False)
+    return Channels.on(MAXONE, electrode), of_patterns

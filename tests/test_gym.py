@@ -275,6 +275,8 @@ def test_recordings_on_disk_are_the_neurons(tmp_path) -> None:
         ({"neural_observation": 1, "recordings": "missing"}, "neural_observation: expected True or False, got 1"),
         ({"delivery": "late", "recordings": "missing"}, "delivery: expected 'chosen' or 'shuffled', got 'late'"),
         ({"mapping": "3-thresholds", "recordings": "missing"}, "mapping: expected one of 1-threshold"),
+        ({"readouts": "halfs", "recordings": "missing"}, "readouts: expected all, halves, quadrants, .*, got 'halfs'"),
+        ({"readouts": "halves", "recordings": "missing"}, "readouts: .*cartpole"),
         ({"kind": "bins", "recordings": "missing"}, "kind: expected one of histogram, empirical, memory, got 'bins'"),
     ],
 )

@@ -265,7 +265,8 @@ def imported(noun: str, place: str) -> Any:
         raise
     except (Exception, SystemExit) as error:
         # Anything may go wrong in a third-party module. The name of a class has no hyphen.
-        hint = f"; a Gymnasium environment is gymnasium:{place}" if re.search(r"-v\d+$", name) else ""
+        is_id = noun == "robot" and re.search(r"-v\d+$", name)
+        hint = f"; a Gymnasium environment is gymnasium:{place}" if is_id else ""
         raise InvalidArgument(f"{noun}: expected {place} to be importable, got {first_line(error)}{hint}") from error
 
 

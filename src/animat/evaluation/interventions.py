@@ -142,11 +142,11 @@ def run_interventions(
     turning = None
     if switch_at is not None:
         # The same episodes, with the same random numbers, with and without a switch.
-        usual_trace, switched = (
+        unswitched, switched = (
             trajectories(*each.within(environment, simulator), policies, episodes=SWITCH_EPISODES, seed=seed)
             for each in (plain, acting[-1])
         )
-        turning = _switch_effect(usual_trace, switched, switch_at)
+        turning = _switch_effect(unswitched, switched, switch_at)
     return InterventionTable(tuple(rows), turning)
 
 

@@ -154,7 +154,7 @@ def _why_refused(address: str, worker: dict[str, Any]) -> str:
 
 
 def _expect_listener(address: str) -> None:
-    """Wait for a listener, as Dask's own wait cannot be interrupted; raises OSError if there is none."""
+    """Wait for a listener, as Dask's own wait cannot be interrupted; raises OSError or ValueError if there is none."""
     kind, has_kind, place = address.rpartition("://")
     host, _, port = place.rpartition(":")
     if has_kind and kind != "tcp":
@@ -184,8 +184,8 @@ def _address(where: str | os.PathLike[str]) -> str:
             f"cluster: expected a scheduler's address, such as tcp://host:8786, or its file, got {str(where)!r}, "
             "which is not a file"
         )
-    kind, has_kind, place = str(where).rpartition("://")
-    if (not has_kind or kind == "tcp") and not place.rpartition(":")[2].isdecimal():
+    kind, _, place = str(where).rpartition("://")
+    if kind.lower() in ("", "tcp", "tls") and not place.rpartition(":")[2].isdecimal():
         raise InvalidArgument(f"cluster: expected an address that ends in a port, such as tcp://host:8786, got {where}")
     return str(where)
 

@@ -193,7 +193,7 @@ class Dispatch:
         shares = 2 * sum(place.threads for place in self._places.values())
         waiting_s = 0.0
         for call in self._waiting:
-            waiting_s += self._duration_of(call)
+            waiting_s += self._expected_s_of(call)
             if waiting_s > shares * self._longest_s:
                 # Thousands may be waiting.
                 break
@@ -203,18 +203,18 @@ class Dispatch:
         total_s = 0.0
         while self._waiting:
             call = self._waiting[0]
-            is_small = self._duration_of(call) < _SMALL_S and not call.deaths
-            if calls and not (is_small and total_s + self._duration_of(call) <= most_s):
+            is_small = self._expected_s_of(call) < _SMALL_S and not call.deaths
+            if calls and not (is_small and total_s + self._expected_s_of(call) <= most_s):
                 break
             self._waiting.popleft()
             if not call.future.done():
                 calls.append(call)
-                total_s += self._duration_of(call)
+                total_s += self._expected_s_of(call)
                 if not is_small:
                     break
         return calls
 
-    def _duration_of(self, call: Call) -> float:
+    def _expected_s_of(self, call: Call) -> float:
         """The expected duration of a call, by the ratio of actual to expected durations so far."""
         return _SMALL_S if call.cost_s is None else call.cost_s * self._took_s / self._expected_s
 

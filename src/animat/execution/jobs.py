@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from graphlib import TopologicalSorter
 from pathlib import Path
 
-from animat.errors import AnimatError, InvalidArgument, counted, expect_at_least, first_line
+from animat.errors import AnimatError, InvalidArgument, counted, expect_at_least, first_line, out_of_memory
 from animat.execution.cluster import Cluster
 from animat.execution.gpu import submit_with_gpu
 from animat.execution.pinned import PinnedProcesses
@@ -240,7 +240,9 @@ def _expect_success(future: Future[TaskResult], job: Job) -> None:
         raise AnimatError(f"{job.name}: {message} ({why}); run again to continue") from error
     except Exception as error:
         # Raised by the executor, as when it cannot send the task.
-        why = ""
-        if isinstance(error, OSError) and error.errno == errno.EMFILE:
+        number, why = getattr(error, "errno", None), ""
+        if number == errno.EMFILE:
             why = " (fewer --workers need fewer, and `ulimit -n` raises the limit)"
+        if number == errno.ENOMEM or out_of_memory(error) is not None or type(error).__name__ == "KilledWorker":
+            why = f" (is there enough memory? {memory_of(job.task)})"
         raise AnimatError(f"{job.name}: {first_line(error)}{why}; run again to continue") from error

@@ -28,7 +28,7 @@ from animat.recordings.reading import read_sources
 from animat.registry import is_ours
 from animat.responses.conditions import conditions_named
 from animat.responses.extraction import extract_series
-from animat.responses.readouts import DEFAULT_READOUTS, Readouts
+from animat.responses.readouts import DEFAULT_READOUTS, Readouts, count_readouts, readouts_named
 from animat.responses.windows import DEFAULT_WINDOW_MS, check_window
 from animat.robots.base import Robot
 from animat.robots.checking import check_robot
@@ -132,6 +132,8 @@ def set_up(
         check_mapping(chosen)
     if recordings is not None:
         read = readouts or DEFAULT_READOUTS.get(body.n_commands, "all")
+        read = readouts_named(read) if isinstance(read, str) else read
+        expect_readout_per_command(body.name, body.n_commands, count_readouts(read))
         series = extract_series(read_sources(recordings), by, window_ms, readouts=read)
         timeline = fit_timeline(series, kind=kind)
         for message in warnings_once(timeline.findings):

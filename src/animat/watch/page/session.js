@@ -278,8 +278,8 @@ export class SessionPage {
     const exceeds = agents.some((each) => each.half !== null && (each.mean - each.half < frame.x[0] || each.mean + each.half > frame.x[1]));
     const predicted = agents.some((each) => each.predicted) ? "Grey: predicted, the bar its 95 % interval, the line its mean." : "The log has no prediction of these returns.";
     this.returns.words.textContent = `${predicted} Blue rings: whole episodes. Orange: their mean and its 95 % interval, which narrows as episodes are added${exceeds ? "; one that reaches the frame extends beyond it" : ""}.`;
-    // As in the table that the command prints; no -0.0.
-    const tenths = (value) => (Math.round(10 * value) / 10 || 0).toFixed(1).replace("-", "\u2212");
+    // One decimal, as in the table that the command prints; no -0.0.
+    const tenths = (value) => value.toFixed(1).replace(/^-0\.0$/, "0.0").replace("-", "\u2212");
     const within = (low, high) => ` (${tenths(low)} to\u00a0${tenths(high)})`;
     const measured = ({ mean, half }) => (mean === null ? "none yet" : `${tenths(mean)}${half === null ? "" : within(mean - half, mean + half)}`);
     table(this.agentTable, ["agent", "episodes", "measured (95 % interval)", "predicted (95 % interval)"], agents.map((each) => [
