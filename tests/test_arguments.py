@@ -83,14 +83,14 @@ def test_lists_and_dictionaries_are_checked_inside_and_unions_said_in_full(tmp_p
         "path: expected a name ending in .nwb, got r.txt": lambda: animat.write_nwb(
             synthetic_recording(1, patterns=3, channels=16), "r.txt"
         ),
-        "make_culture: expected a function that returns a culture, such as animat.VirtualCulture(seed=1), got "
+        "make_culture: expected a function that returns a culture, such as lambda: animat.VirtualCulture(seed=1), got "
         "VirtualCulture(seed=1)": lambda: animat.record_series(
             animat.VirtualCulture(1),  # type: ignore[arg-type]
             animat.Protocol(),
             tmp_path,
         ),
         "protocol: expected a protocol, such as animat.Protocol(trials=5), or a function that returns a protocol, such "
-        "as animat.Protocol(trials=5), got 'slow.json'": lambda: animat.record_series(
+        "as lambda: animat.Protocol(trials=5), got 'slow.json'": lambda: animat.record_series(
             lambda: animat.VirtualCulture(1),
             "slow.json",  # type: ignore[arg-type]
             tmp_path,

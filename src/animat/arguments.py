@@ -144,7 +144,7 @@ def _words(hint: Any) -> str:
         return _SEVERAL.get(f"{_name(each)}{' by name' * by_name}") or f"several of: {_words(each)}"
     what = _ONE.get(_name(hint)) or f"a {_name(hint)}"
     if kind is Callable and inner and inner[-1] is not NoneType:
-        return f"{what} that returns {_words(inner[-1])}"
+        return f"{what} that returns {_words(inner[-1]).replace('such as ', 'such as lambda: ')}"
     return what
 
 
