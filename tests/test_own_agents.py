@@ -160,6 +160,7 @@ def test_an_agent_outside_jax_is_evaluated_as_one_in_jax_and_a_policy_as_itself(
     ("name", "agent", "message"),
     [
         ("mine", Wrong(17), "agents: mine: act: expected the index of .* from 0 to 4, got 17"),
+        ("mine", Wrong(True), "agents: mine: act: expected the index of .* from 0 to 4, got True"),
         pytest.param("mine", Wrong(0.5), "whole number from 0 to 4, got 0.5", marks=pytest.mark.oracle),
         pytest.param("mine", Wrong(None), "whole number from 0 to 4, got None", marks=pytest.mark.oracle),
         # A closed loop refuses it, too.

@@ -180,7 +180,7 @@ class SimulatorOptions(ResponseOptions):
         fitted = {} if trained is None else trained.fitted
         fit = simulator_settings(fitted, self.simulator, self.bins, self.range_hz)
         if not recordings:
-            raise InvalidArgument("--recordings: expected files or folders of recordings, got none")
+            raise InvalidArgument("--recordings: expected files or folders, as animat record makes them, got none")
         by = self.conditions or fitted.get("by")
         # Before recordings are read, which can take a while.
         conditions = None if by is None else conditions_named(by)

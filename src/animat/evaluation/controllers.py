@@ -53,7 +53,8 @@ def sees_neurons(controller: Controller) -> bool:
 def expect_condition(chosen: Any, n: int) -> int:
     """The chosen index as a plain number; InvalidArgument if it is none of n conditions."""
     try:
-        index = operator.index(chosen)
+        # True is no more the index 1 than it is in numpy.
+        index = -1 if isinstance(chosen, bool) else operator.index(chosen)
     except TypeError:
         index = -1
     if not 0 <= index < n:

@@ -98,8 +98,8 @@ def old_calibration(age_min: float, now: str) -> Iterator[Finding]:
     """A warning if the predicting recording was made long before another one, or a session."""
     if age_min > OLD_MIN:
         age = f"{age_min:.0f} min" if age_min < 600 else f"{age_min / 60:.0f} h"
-        from_ = f"percentiles and prediction are from a recording made {age} before {now}"
-        message = f"{from_}: cultures drift; use a later recording (--at-min), or train on later ones"
+        remedy = "use a later recording (--at-min of evaluate and run), or train on later ones"
+        message = f"percentiles and prediction are from a recording made {age} before {now}: cultures drift; {remedy}"
         yield Finding("old-calibration", "warning", message, age_min)
 
 
