@@ -277,6 +277,7 @@ def test_recordings_on_disk_are_the_neurons(tmp_path) -> None:
         ({"mapping": "3-thresholds", "recordings": "missing"}, "mapping: expected one of 1-threshold"),
         ({"readouts": "halfs", "recordings": "missing"}, "readouts: expected all, halves, quadrants, .*, got 'halfs'"),
         ({"readouts": "halves", "recordings": "missing"}, "readouts: .*cartpole"),
+        ({"readouts": 3, "recordings": "missing"}, "readouts: expected readouts, such as 'halves', got 3$"),
         ({"kind": "bins", "recordings": "missing"}, "kind: expected one of histogram, empirical, memory, got 'bins'"),
     ],
 )

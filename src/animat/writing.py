@@ -104,12 +104,12 @@ def exclusive_lock(folder: str | os.PathLike[str]) -> Iterator[None]:
         folder.mkdir(parents=True, exist_ok=True)
         descriptors = [os.open(folder, os.O_RDONLY)]
     try:
-        if try_lock(folder, descriptors[0]):
+        if take_lock(folder, descriptors[0]):
             _expect_same(folder, descriptors[0])
         else:
             with suppress(OSError):
                 descriptors.append(os.open(folder / LOCK, os.O_RDWR | os.O_CREAT, 0o666))
-                try_lock(folder, descriptors[1])
+                take_lock(folder, descriptors[1])
         try:
             yield
         except BaseException:
@@ -122,8 +122,8 @@ def exclusive_lock(folder: str | os.PathLike[str]) -> Iterator[None]:
             os.close(descriptor)
 
 
-def try_lock(folder: Path, descriptor: int) -> bool:
-    """Lock an open folder or file for as long as it is open; False if the file system cannot."""
+def take_lock(folder: Path, descriptor: int) -> bool:
+    """Lock an open folder or file while it is open; False if the file system cannot; Mismatch if it is taken."""
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError as error:

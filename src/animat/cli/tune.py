@@ -39,8 +39,8 @@ class TuneFile(JobOptions):
         cells = []
         names = ("own settings", "defaults")[: len(first_settings(tuning.study, tuning.space))]
         errors = [each.standard_error for each in tuned.finals if each.standard_error]
-        # The smallest standard error has two digits.
-        decimals = max(1, 1 - math.floor(math.log10(min(errors)))) if errors else 1
+        # The smallest standard error has two digits, unless it is only rounding.
+        decimals = min(4, max(1, 1 - math.floor(math.log10(min(errors))))) if errors else 1
         for final in sorted(tuned.finals, key=lambda each: -each.mean):
             error = "" if final.standard_error is None else f"{final.standard_error:.{decimals}f}"
             name = names[final.trial] if final.trial < len(names) else f"trial {final.trial}"

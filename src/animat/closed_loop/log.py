@@ -29,7 +29,7 @@ from jaxtyping import Float64, Int64
 from animat.errors import InvalidFile, as_invalid_file
 from animat.plain_file import expect_plain_file
 from animat.recordings.formats.nwb_spikes import SpikeBlock
-from animat.writing import sync_folder, try_lock
+from animat.writing import sync_folder, take_lock
 
 MAGIC = b"ANIMATL1"
 RECORD = b"REC1"
@@ -66,7 +66,7 @@ class LogWriter:
             stack.callback(path.unlink, missing_ok=True)
             stack.callback(self.close)
             # Nobody recovers the session while it is running.
-            try_lock(path.parent, self._file)
+            take_lock(path.parent, self._file)
             self._write(MAGIC)
             self.append(LogRecord(self._header))
             self.sync()

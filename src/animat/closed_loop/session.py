@@ -28,7 +28,7 @@ from animat.recordings.metadata import from_metadata
 from animat.recordings.recording import Recording
 from animat.stimulation.stimulus import Stimuli
 from animat.tables import UNKNOWN
-from animat.writing import atomic_write, clear_leftovers, exclusive_lock, expect_writable, try_lock
+from animat.writing import atomic_write, clear_leftovers, exclusive_lock, expect_writable, take_lock
 
 _OR_RUNNING = ", or it is still running"
 LOG_FILE = "session.log"
@@ -276,7 +276,7 @@ def recover_session(path: str | os.PathLike[str], progress: Progress | None = No
     folder = read_session(path).folder
     with exclusive_lock(folder), open_file(folder / LOG_FILE) as log:
         # A running session holds it.
-        try_lock(folder, log.fileno())
+        take_lock(folder, log.fileno())
         session = read_session(path)
         ended = session.ending.message.removesuffix(_OR_RUNNING)
         session = replace(session, ending=replace(session.ending, message=ended))

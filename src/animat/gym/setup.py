@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
+from animat.arguments import check_argument
 from animat.coding.checking import check_mapping
 from animat.coding.decoder import expect_readout_per_command
 from animat.coding.mapping import Mapping, mapping_named
@@ -132,6 +133,7 @@ def set_up(
         check_mapping(chosen)
     if recordings is not None:
         read = readouts or DEFAULT_READOUTS.get(body.n_commands, "all")
+        check_argument("readouts", read, str | Readouts)
         read = readouts_named(read) if isinstance(read, str) else read
         expect_readout_per_command(body.name, body.n_commands, count_readouts(read))
         series = extract_series(read_sources(recordings), by, window_ms, readouts=read)
@@ -142,6 +144,7 @@ def set_up(
         simulator = timeline.at(timeline.start_min[row])
         labels = tuple(condition.label for condition in timeline.conditions)
     elif simulator is not None:
+        expect_readout_per_command(body.name, body.n_commands, simulator.n_readouts)
         labels = tuple(f"condition {i}" for i in range(simulator.n_conditions))
     elif body.n_commands > 1:
         raise InvalidArgument(
@@ -150,7 +153,6 @@ def set_up(
         )
     else:
         simulator, labels = synthetic_simulator(), LABELS
-    expect_readout_per_command(body.name, body.n_commands, simulator.n_readouts)
     environment: Environment[Any] = Animat(body, chosen, simulator.n_conditions)
     if delivery == "shuffled":
         environment = ShuffledDelivery(environment)
