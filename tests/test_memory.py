@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from fractions import Fraction
+from functools import partial
 from pathlib import Path
 from typing import Any, get_args
 
@@ -27,6 +28,7 @@ from animat.evaluation.optimum import best_return, best_returns
 from animat.evaluation.rollouts import Constant, Uniform, heuristic_policy, networks_of, roll_out
 from animat.execution.training import train
 from animat.neurons.fidelity import fidelity
+from animat.neurons.history import Ranked
 from animat.neurons.history_tracker import HistoryState, HistoryTracker
 from animat.neurons.memory import NO_MEMORY, Memory, MemorySimulator, _slopes, fit_memory
 from animat.neurons.simulator import EmpiricalSimulator, fit_empirical
@@ -89,12 +91,15 @@ def histories_by_hand(responses: Responses, memory: Memory) -> list[Fraction]:
         return sum(alike, Fraction(0)) / len(alike) if c >= 0 else Fraction(1, 2)
 
     presented, place = responses.presentations
-    history, histories = Fraction(0), []
+    # Silence is a response of 0 to no stimulus.
+    silence = max(Fraction(0), -weight / 2)
+    history, histories = silence, []
     columns = (presented.condition, presented.rate_hz, presented.is_burst, presented.is_rested)
     for c, value, is_burst, is_rested in zip(*(column.tolist() for column in columns), strict=True):
-        history = Fraction(0) if is_rested else history
+        history = silence if is_rested else history
         histories.append(history)
-        left = (1 - decay) * (rank(value) + weight * mean(c)) / (1 + weight)
+        parts = (rank(value) + weight * mean(c)) / (1 + weight) if weight >= 0 else rank(value) + weight * mean(c)
+        left = (1 - decay) * (parts + silence)
         history = Fraction(1, 2) if is_burst else decay * history + left
     return [histories[row] for row in place]
 
@@ -102,7 +107,7 @@ def histories_by_hand(responses: Responses, memory: Memory) -> list[Fraction]:
 MEMORIES = st.builds(
     Memory,
     st.sampled_from([0.0, 0.25, 0.5]),
-    st.sampled_from([0.0, 0.5, 1.0]),
+    st.sampled_from([-1.0, -0.25, 0.0, 0.5, 1.0]),
     st.sampled_from([0.5, 0.8, 1.0]),
     st.just(0.0),
 )
@@ -287,7 +292,8 @@ def test_of_exponents_as_good_as_the_best_the_largest_is_taken() -> None:
     rank = (rankdata(responses.rate_hz) - 0.5) / n
     traces, means = [0.0], [rank[condition == c].mean() for c in (0, 1)]
     for r, c in zip(rank, condition.tolist(), strict=True):
-        more = (1 - found.decay) * (r + found.weight * means[c]) / (1 + found.weight)
+        stimulus = found.weight * means[c]
+        more = (1 - found.decay) * ((r + stimulus) / (1 + found.weight) if found.weight >= 0 else r + stimulus)
         traces.append(found.decay * traces[-1] + more)
     errors: dict[float, list[float]] = {exponent: [] for exponent in (0.5, 0.6, 0.7, 0.8, 0.9)}
     for exponent, squares in errors.items():
@@ -301,7 +307,54 @@ def test_of_exponents_as_good_as_the_best_the_largest_is_taken() -> None:
     best = np.array(min(errors.values(), key=np.mean))
     worse = {exponent: np.array(squares) - best for exponent, squares in errors.items()}
     as_good = [exponent for exponent, by in worse.items() if by.mean() <= by.std() / np.sqrt(n)]
-    assert as_good == [0.5, 0.6] and found.neighbour_exponent == pytest.approx(0.6)
+    assert as_good == [0.6, 0.7] and found.neighbour_exponent == pytest.approx(0.7)
+
+
+def network_of_its_own(n: int, seed: int) -> Responses:
+    """Responses of stimuli of three strengths, plus a noise that lasts, whatever the stimuli are."""
+    rng = np.random.default_rng(seed)
+    condition, lasting, x = rng.integers(0, 3, n), 0.0, np.zeros(n)
+    for i, noise in enumerate(rng.normal(0, 10, n)):
+        apart = 0.7 * lasting + noise
+        x[i] = 100 + 12 * condition[i] + apart
+        lasting = 0.6 * lasting + 0.4 * apart
+    columns = {"condition": condition, "rate_hz": x, "active_ratio": np.full(n, 0.1), "is_burst": np.zeros(n, bool)}
+    return replace(responses_of(*[[1.0]] * 3), presented=None, place=None, **columns)
+
+
+def test_where_stimuli_leave_no_trace_a_response_counts_by_its_difference_from_the_mean() -> None:
+    """The same stimulus again and again is then answered as among others: on average the noise is 0."""
+    for seed in (1, 2):
+        responses = network_of_its_own(3000, seed)
+        simulator = fit_memory(responses)
+        assert simulator.memory.weight <= -0.85 and simulator.memory.decay == pytest.approx(0.6)
+
+        def trial(history: Any, uniform: Any, simulator: MemorySimulator = simulator) -> Any:
+            answer = jax.vmap(simulator.answer, (None, 0, 0))(jnp.int32(2), uniform, history)
+            return answer.history, answer.rate_hz
+
+        first, uniforms = after(np.full(400, 0.5)), jax.random.uniform(jax.random.key(1), (60, 400))
+        rate_hz = np.asarray(jax.lax.scan(trial, first, uniforms)[1])
+        usual_hz = responses.rate_hz[responses.condition == 2].mean()
+        ranks_alone = fit_memory(responses, memory=Memory(0.45, 0.0, 0.7))
+        others_hz = np.asarray(jax.lax.scan(partial(trial, simulator=ranks_alone), first, uniforms)[1])
+        # The standard deviation of a response is 12.
+        assert abs(rate_hz[20:].mean() - usual_hz) < 2.5 and others_hz[20:].mean() > usual_hz + 6
+
+
+def test_after_silence_the_trace_is_that_of_no_stimulus_and_no_response() -> None:
+    responses = network_of_its_own(300, 1)
+    rests = np.arange(300) % 2 == 0
+    rested = replace(responses, presented=replace(responses.presentations[0], is_rested=rests), place=np.arange(300))
+    for weight, silence in ((-1.0, 0.5), (-0.25, 0.125), (0.0, 0.0), (2.0, 0.0)):
+        memory = Memory(0.6, weight, 0.7)
+        np.testing.assert_allclose(Ranked(rested).traces(memory)[::2], silence)
+        simulator = replace(fit_memory(responses, memory=memory), rests=jnp.ones(3, bool))
+        answers = [simulator.answer(jnp.int32(1), jnp.float32(0.3), after(trace)) for trace in (0.1, 0.9)]
+        expected = simulator.answer_at(jnp.int32(1), jnp.float32(0.3), jnp.float32(silence), jnp.float32(0.5))
+        assert all(float(answer.rate_hz) == float(expected[0]) for answer in answers)
+        tracker = HistoryTracker.of(responses, simulator)
+        assert tracker.when(HistoryState(0.9, 0.5, 1.0), 3.0, is_rested=True).trace == silence
 
 
 def test_responses_that_are_all_the_same_have_no_slopes() -> None:

@@ -86,7 +86,7 @@ class Driver:
         self._zero_s = self._observed_until_s = self._last_pulse_s = 0.0
         self._data_at_s = self._wall_zero_s = 0.0
         self._last_command: float | tuple[float, ...] = 0.0
-        self._remembered = HistoryState()
+        self._remembered = HistoryState() if loop.history is None else loop.history.at_rest
         self._last_delivered: dict[str, list[int]] = {}
         """Conditions delivered in the last whole episode of each agent, the newest last."""
 

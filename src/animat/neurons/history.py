@@ -21,18 +21,20 @@ are 0 after silence (`animat.neurons.memory`).
 class Memory(NamedTuple):
     """How the history state follows from stimuli and responses, and how strongly a response depends on it.
 
-        p' = decay p + (1 - decay) (r + weight m) / (1 + weight)
+        p' = decay p + (1 - decay) (r + weight m) / (1 + weight)      with a weight of 0 or more
+        p' = decay p + (1 - decay) (r + weight (m - 1/2))             below 0
         l  = exp(-t / load_s) l',    l' = l + c
 
     The trace p summarises the latest responses: p before a response and p' after it, r the response's rank (the share
-    of all responses below it), m the mean rank of its condition; all are in [0, 1], 0 after silence. Ranks are of the
-    response of all channels, even with several readouts. The load l is how much was stimulated in the last seconds: it
+    of all responses below it), m the mean rank of its condition. Ranks are in [0, 1], and 0 for silence; they are of
+    the response of all channels, even with several readouts. With the weight -1 the trace is how far responses have
+    been above the means of their conditions, plus 1/2. The load l is how much was stimulated in the last seconds: it
     decays during the time t from one trial to the next, and each trial adds c, chosen so that the mean load over the
     recording is 0.5.
 
     Attributes:
         decay: of the previous trace; 0: only the last trial is remembered.
-        weight: of the stimulus relative to the response; 0: only the response is remembered.
+        weight: of the stimulus relative to the response, from -1; 0: only the response is remembered.
         neighbour_exponent: of n responses, the n^neighbour_exponent with the nearest histories may be drawn; 1: all.
         load_s: the load's time constant, s; 0: no load.
     """
@@ -41,6 +43,11 @@ class Memory(NamedTuple):
     weight: float
     neighbour_exponent: float
     load_s: float = 0.0
+
+    @property
+    def silence(self) -> float:
+        """The trace after silence, in which rank and mean are 0."""
+        return max(0.0, -self.weight / 2)
 
 
 NO_MEMORY = Memory(0.0, 0.0, 1.0)
@@ -100,10 +107,10 @@ class Ranked:
         # For trials without a condition, the middle rank is as good as any.
         means = np.where(presented.condition == NO_CONDITION, 0.5, self.means[presented.condition])
         left = trace_increment(ranks_among(self.sorted_hz, presented.rate_hz), means, memory)
-        trace, traces = 0.0, []
+        trace, traces = memory.silence, []
         trials = (presented.is_rested.tolist(), presented.is_burst.tolist(), left.tolist())
         for is_rested, is_burst, more in zip(*trials, strict=True):
-            trace = 0.0 if is_rested else trace
+            trace = memory.silence if is_rested else trace
             traces.append(trace)
             # The trace after a burst is not known: the next response is not drawn, and the trace starts again.
             trace = 0.5 if is_burst else memory.decay * trace + more
@@ -142,4 +149,6 @@ def trace_increment(
     rank: Float64[np.ndarray, " responses"], mean: Float64[np.ndarray, "#responses"] | float, memory: Memory
 ) -> Float64[np.ndarray, " responses"]:
     """What responses add to the trace."""
+    if memory.weight < 0:
+        return np.asarray((1 - memory.decay) * (rank + memory.weight * (mean - 0.5)))
     return np.asarray((1 - memory.decay) * (rank + memory.weight * mean) / (1 + memory.weight))

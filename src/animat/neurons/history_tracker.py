@@ -49,6 +49,11 @@ class HistoryTracker:
             memory, added = simulator.memory, float(simulator.added)
         return cls(memory, added, ranked.sorted_hz, ranked.means)
 
+    @property
+    def at_rest(self) -> HistoryState:
+        """The state before the first trial."""
+        return HistoryState(self.memory.silence)
+
     def when(self, before: HistoryState, at_s: float, *, is_rested: bool) -> HistoryState:
         """The state at a trial that is read after the pulse at `at_s`.
 
@@ -57,7 +62,7 @@ class HistoryTracker:
         """
         load_s = self.memory.load_s
         load = before.load * np.exp((before.at_s - at_s) / load_s) if load_s else before.load
-        return HistoryState(0.0 if is_rested else before.trace, float(load), float(at_s))
+        return HistoryState(self.memory.silence if is_rested else before.trace, float(load), float(at_s))
 
     def after(self, at_trial: HistoryState, condition: int, rate_hz: float, *, is_burst: bool) -> HistoryState:
         """The state after a trial, from that at it and the response of all channels, Hz per channel."""
@@ -131,7 +136,7 @@ class AdjustedRanks:
         presented, place = responses.presentations
         if presented.time_s is None:
             raise UnusableData("responses.presented.time_s: expected the times of all trials, got none")
-        state, history = HistoryState(), []
+        state, history = self.remembering.at_rest, []
         trials = (presented.time_s, presented.is_rested, presented.condition, presented.rate_hz, presented.is_burst)
         for at_s, is_rested, condition, rate_hz, is_burst in zip(*(x.tolist() for x in trials), strict=True):
             at_trial = self.remembering.when(state, at_s, is_rested=is_rested)

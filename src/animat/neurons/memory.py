@@ -18,9 +18,10 @@ from animat.neurons.simulator import Answer, EmpiricalSimulator, Index, Rates, S
 from animat.responses.responses import Responses
 from animat.tables import briefly
 
-_DECAYS = (0.0, 0.15, 0.3, 0.45)
-_WEIGHTS = (0.0, 0.5, 1.0, 2.0, 4.0)
-"""The larger ones suit few channels, whose response says less about the network than the stimulus does."""
+_DECAYS = (0.0, 0.15, 0.3, 0.45, 0.6)
+_WEIGHTS = (-1.0, -0.75, -0.5, -0.25, 0.0, 0.5, 1.0, 2.0, 4.0)
+"""The larger ones suit few channels, whose response says less about the network than the stimulus does. Those below 0
+suit conditions of one frequency: a large response to a strong stimulus says little about the network."""
 _EXPONENTS = (0.5, 0.6, 0.7, 0.8, 0.9)
 _LOAD_S = 1.0
 """Chosen on virtual cultures 1 to 5: of 0.5, 1, 2 and 4 s it predicted the responses in their closed loops best."""
@@ -47,14 +48,14 @@ class MemorySimulator(EmpiricalSimulator):
         before: each response's position in that order, rising, infinity as padding, shape (conditions, most responses).
         histories: the history state before them, trace and load (`Answer`), shape (conditions, most responses, 2).
         after_hz: the responses in that order, shape (conditions, most responses), or with a last axis of readouts.
-        left: what each adds to the trace, (1 - decay) (r + weight m) / (1 + weight), in the shape of `before`.
+        left: what each adds to the trace (`Memory`), in the shape of `before`.
         followers: the number of these responses, which are those not preceded by a burst, shape (conditions,).
         nearest: k of each condition, shape (conditions,).
         toward: a and b of each condition, shape (conditions, 2).
         kept: the share of the load that is left when a trial of each condition comes, shape (conditions,).
         added: c, what a trial adds to the load.
         decay, weight, neighbour_exponent, load_s: as in `Memory`.
-        rests: whether trials of each condition come after silence, so that the trace is 0; None: none do.
+        rests: whether trials of each condition come after silence, so that the trace is `silence`; None: none do.
 
     Source: the nearest-neighbour bootstrap of Lall and Sharma 1996 (doi:10.1029/95WR02966), of one number, unweighted.
     """
@@ -83,9 +84,16 @@ class MemorySimulator(EmpiricalSimulator):
         """The memory of a single recording's simulator, as `fit_memory` takes it."""
         return Memory(float(self.decay), float(self.weight), float(self.neighbour_exponent), float(self.load_s))
 
+    @property
+    def silence(self) -> Scalar:
+        """The trace after silence, as in `Memory`."""
+        return jnp.maximum(0.0, -jnp.asarray(self.weight) / 2)
+
     def answer(self, condition: Index, uniform: Scalar, history: Float[Array, "2"]) -> Answer:
         load = jnp.asarray(self.kept)[condition] * history[1]
-        trace = history[0] if self.rests is None else jnp.where(jnp.asarray(self.rests)[condition], 0.0, history[0])
+        trace = history[0]
+        if self.rests is not None:
+            trace = jnp.where(jnp.asarray(self.rests)[condition], self.silence, trace)
         rate_hz, trace = self.answer_at(condition, uniform, trace, load)
         return Answer(rate_hz, jnp.stack([trace, load + jnp.asarray(self.added)]))
 
@@ -113,13 +121,14 @@ def fit_memory(responses: Responses, *, room: int | None = None, memory: Memory 
     """Keep every condition's non-burst responses, with their histories, to draw from.
 
     The form of the trace and the neighbour exponent are found by leaving out each response in turn and predicting its
-    rank by the mean of its neighbours. Of twenty forms of the trace the one with the smallest error is taken, and of
-    its exponents the largest that is as good as the best, within one standard error of the difference. If none predicts
-    better than no history at all by two standard errors, the simulator has no memory. If one does, and the times of the
-    trials are known, a load with a time constant of one second is added if it explains ranks beyond the trace
-    (p < 0.01, F test of linear regressions).
+    rank by the mean of its neighbours. Of 45 forms of the trace the one with the smallest error is taken, and of its
+    exponents the largest that is as good as the best, within one standard error of the difference. If its weight is
+    below 0, decay and weight are then those with which a linear regression of each condition's ranks over the trace
+    explains most. If no form predicts better than no history at all by two standard errors, the simulator has no
+    memory. If one does, and the times of the trials are known, a load with a time constant of one second is added if it
+    explains ranks beyond the trace (p < 0.01, F test of linear regressions).
 
-    The decay is from 0 to 0.45, the weight from 0 to 4, the exponent from 0.5 to 0.9. How strongly the responses to a
+    The decay is from 0 to 0.6, the weight from -1 to 4, the exponent from 0.5 to 0.9. How strongly the responses to a
     condition depend on trace and load, a slope for each, is moved towards the slopes of all conditions together, the
     less certain it is (empirical Bayes).
 
@@ -178,21 +187,43 @@ def _find_memory(ranked: Ranked) -> Memory:
         return NO_MEMORY
     # With all responses as neighbours the history does not matter.
     errors = {NO_MEMORY: _errors(ranked.rank, np.zeros(len(ranked.rank)), rows, [1.0])[0]}
-    for decay, weight in itertools.product(_DECAYS, _WEIGHTS):
-        history = ranked.traces(Memory(decay, weight, 1.0))
-        of_exponents = _errors(ranked.rank, history, rows, _EXPONENTS)
-        errors |= {Memory(decay, weight, each): of for each, of in zip(_EXPONENTS, of_exponents, strict=True)}
-    best = min(errors, key=lambda memory: float(errors[memory].mean()))
+
+    def of_form(decay: float, weight: float) -> dict[Memory, Float64[np.ndarray, " rows"]]:
+        of_exponents = _errors(ranked.rank, ranked.traces(Memory(decay, weight, 1.0)), rows, _EXPONENTS)
+        return {Memory(decay, weight, each): of for each, of in zip(_EXPONENTS, of_exponents, strict=True)}
+
+    def best_of(errors: dict[Memory, Float64[np.ndarray, " rows"]]) -> Memory:
+        return min(errors, key=lambda memory: float(errors[memory].mean()))
 
     def is_as_good(memory: Memory, standard_errors: float) -> bool:
         worse = errors[memory] - errors[best]
         return bool(worse.mean() <= standard_errors * worse.std() / np.sqrt(len(worse)))
 
+    for form in itertools.product(_DECAYS, _WEIGHTS):
+        errors |= of_form(*form)
+    best = best_of(errors)
     if is_as_good(NO_MEMORY, _CERTAIN):
         return NO_MEMORY
+    if best.weight < 0:
+        errors = of_form(*_refined(ranked))
+        best = best_of(errors)
     alike = [memory for memory in errors if memory[:2] == best[:2] and is_as_good(memory, 1.0)]
     found = max(alike, key=lambda memory: memory.neighbour_exponent)
     return found._replace(load_s=_LOAD_S if _has_load(ranked, found) else 0.0)
+
+
+def _refined(ranked: Ranked) -> tuple[float, float]:
+    """The decay, and the weight below 0, whose trace explains most by a regression of each condition's ranks.
+
+    By means of neighbours the choice between -1 and -0.5 is often chance, and returns depend on it.
+    """
+
+    def explained(form: tuple[float, float]) -> float:
+        trace = ranked.traces(Memory(*form, 1.0))
+        centred = ((of[rows] - of[rows].mean() for of in (trace, ranked.rank)) for rows in ranked.rows)
+        return sum(float(x @ y) ** 2 / (float(x @ x) or 1.0) for x, y in centred)
+
+    return max(itertools.product(_DECAYS, (-np.arange(1, 21) / 20).tolist()), key=explained)
 
 
 def _has_load(ranked: Ranked, memory: Memory) -> bool:

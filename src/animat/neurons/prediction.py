@@ -259,7 +259,7 @@ def _runs_with_memory(
 
     def trial(trace: Float[Array, " n"], inputs: tuple[Array, ...]) -> tuple[Array, Array]:
         condition, load, left, is_answered, is_burst, is_rested, uniform = inputs
-        trace = jnp.where(is_rested, 0.0, trace)
+        trace = jnp.where(is_rested, simulator.silence, trace)
         rate_hz, after = answer(condition, uniform, trace, load)
         after = jnp.where(is_answered, after, jnp.asarray(simulator.decay) * trace + left)
         # As in `history.Ranked`: the trace after a burst is not known.

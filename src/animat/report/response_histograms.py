@@ -116,7 +116,7 @@ def draw_responses_over_time(series: Sequence[Responses]) -> Figure:
     left_out = [f"{n} of {every} {what}" for what, n, every in numbers if n < every]
     if left_out or beyond:
         figure.suptitle(", ".join(filter(None, [*left_out, beyond])), fontsize=10)
-    figure.supxlabel(_RATE, fontsize=9)
+    figure.supxlabel(f"{_RATE}; the line is the median", fontsize=9)
     return figure
 
 
