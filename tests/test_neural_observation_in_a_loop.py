@@ -69,17 +69,18 @@ def test_trial_by_trial_it_is_the_state_of_the_recording(responses: Responses, r
         )
 
 
-def test_trials_without_a_condition_are_remembered_too(responses: Responses) -> None:
+@pytest.mark.parametrize("memory", [MEMORY, MEMORY._replace(weight=-0.75)])
+def test_trials_without_a_condition_are_remembered_too(responses: Responses, memory: Memory) -> None:
     some = responses.only([0, 4])
-    of_some = HistoryTracker.of(some, fit_memory(some, memory=MEMORY))
-    (presented, place), state, states = some.presentations, HistoryState(), []
+    of_some = HistoryTracker.of(some, fit_memory(some, memory=memory))
+    (presented, place), state, states = some.presentations, of_some.at_rest, []
     assert presented.time_s is not None and (presented.condition == NO_CONDITION).any()
     columns = (presented.condition, presented.rate_hz, presented.is_burst, presented.is_rested, presented.time_s)
     for condition, rate_hz, is_burst, is_rested, at_s in zip(*columns, strict=True):
         came = of_some.when(state, at_s, is_rested=is_rested)
         states.append((came.trace, came.load))
         state = of_some.after(came, condition, rate_hz, is_burst=is_burst)
-    np.testing.assert_allclose(np.array(states)[place], Ranked(some).states(MEMORY), atol=1e-6)
+    np.testing.assert_allclose(np.array(states)[place], Ranked(some).states(memory), atol=1e-6)
 
 
 def test_without_memory_it_is_what_simulators_without_memory_show(responses: Responses) -> None:

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from animat.neurons.history import Memory
 from animat.neurons.history_tracker import AdjustedRanks
 from animat.neurons.memory import fit_memory
 from animat.responses.quality.history import repetition_findings, repetitions
@@ -66,10 +67,12 @@ def test_repetitions_are_counted_as_by_hand(seed: int, silences: float) -> None:
     np.testing.assert_array_equal(repetitions(responses.at_rows(rows)), np.array(expected)[rows])
 
 
-@pytest.mark.parametrize("of_the_last", [0.0, 0.5])
-def test_adjusted_ranks_of_a_recording_and_of_the_same_responses_elsewhere_agree(of_the_last: float) -> None:
+@pytest.mark.parametrize(("of_the_last", "memory"), [(0.0, None), (0.5, None), (0.5, Memory(0.6, -0.85, 0.7))])
+def test_adjusted_ranks_of_a_recording_and_of_the_same_responses_elsewhere_agree(
+    of_the_last: float, memory: Memory | None
+) -> None:
     responses = mixed(3, of_the_last=of_the_last, silences=0.05)
-    adjusted = AdjustedRanks.of(responses, fit_memory(responses))
+    adjusted = AdjustedRanks.of(responses, fit_memory(responses, memory=memory))
     ranks = adjusted.of_responses(responses)
     for condition, expected in enumerate(adjusted.ranks):
         np.testing.assert_allclose(ranks[responses.condition == condition], expected, atol=1e-6)

@@ -311,7 +311,8 @@ def test_where_no_memory_is_found_it_brings_nothing() -> None:
     assert found.gain("memory", "empirical") == (0.0, 0.0)
 
 
-def test_a_free_run_remembers_its_own_answers() -> None:
+@pytest.mark.parametrize(("weight", "silence"), [(0.5, 0.0), (-1.0, 0.5)])
+def test_a_free_run_remembers_its_own_answers(weight: float, silence: float) -> None:
     """Trial by trial: what the simulator does not answer it is given, and a rest is forgotten over."""
     rng = np.random.default_rng(2)
     n = 300
@@ -331,7 +332,7 @@ def test_a_free_run_remembers_its_own_answers() -> None:
         time_s=time_s[place],
     )
     halves = halved(responses)
-    simulator = fit_memory(halves.first, memory=Memory(0.3, 0.5, 0.6, 1.0))
+    simulator = fit_memory(halves.first, memory=Memory(0.3, weight, 0.6, 1.0))
     ranked = Ranked(halves.first)
     (traces, left), loads = ranked.recorded(simulator.memory), ranked.loads(simulator.memory.load_s).every
     assert simulator.load_s > 0
@@ -349,7 +350,7 @@ def test_a_free_run_remembers_its_own_answers() -> None:
     for k in range(3):
         trace, expected = traces[since], np.full(n, np.nan)
         for p in range(since, n):
-            trace = 0.0 if rested[p] else trace
+            trace = silence if rested[p] else trace
             if p in places:
                 expected[p], trace = answer_at(every[p], uniforms[p - since, k], jnp.float32(trace), loads[p])
             else:

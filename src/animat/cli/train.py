@@ -303,15 +303,18 @@ def _memories(timeline: SimulatorTimeline) -> Iterator[str]:
             decay, weight, _, load_s = memory = simulator.memory
             near, total = (int(np.median(counts)) for counts in (simulator.nearest, simulator.followers))
             load = f". It also depends on the amount of stimulation in the last {load_s:g} s" if load_s else ""
-            stimulus = f"stimulus {weight:.2g} times as much as its response"
+            share = f"each trial counts {decay:.2g} times as much as the one after it"
             if weight < 0:
-                stimulus = f"response less {-weight:.2g} times the mean of its condition"
-            earlier = "the trial before it, whose" if weight < 0 else "the trial before it, whose stimulus counts"
-            if decay:
-                share = f"each trial counts {decay:.2g} times as much as the one after it"
-                earlier = f"earlier trials, where {share}, and its"
+                less = f"{-weight:.2g} times the mean rank of its condition is subtracted from the rank of its response"
+                earlier = (
+                    f"earlier trials, where {share}, and {less}" if decay else f"the trial before it, where {less}"
+                )
+            else:
+                counts = f"{weight:.2g} times as much as its response"
+                earlier = f"the trial before it, whose stimulus counts {counts}"
+                earlier = f"earlier trials, where {share}, and its stimulus {counts}" if decay else earlier
             text = (
-                f"a response depends on {earlier} {stimulus}{load}. The simulator "
+                f"a response depends on {earlier}{load}. The simulator "
                 f"draws from the {near} responses with the most similar history, out of {total:,} per condition"
             )
             yield f"memory at {in_min(start_min)}: {'none was found' if memory == NO_MEMORY else text}"

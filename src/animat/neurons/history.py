@@ -13,23 +13,22 @@ from animat.responses.responses import Responses
 INITIAL_HISTORY = (0.5, 0.5)
 """Trace and load at the start of an episode: its warm-up was presented in random order, as in a recording.
 
-The trace summarises the latest responses, from 0 to 1; the load the stimulation of the last seconds, 0 or more. Both
-are 0 after silence (`animat.neurons.memory`).
+The trace summarises the latest responses, from 0 to 1; the load the stimulation of the last seconds, 0 or more.
 """
 
 
 class Memory(NamedTuple):
     """How the history state follows from stimuli and responses, and how strongly a response depends on it.
 
-        p' = decay p + (1 - decay) (r + weight m) / (1 + weight)      with a weight of 0 or more
-        p' = decay p + (1 - decay) (r + weight (m - 1/2))             below 0
+        p' = decay p + (1 - decay) (r + weight m) / (1 + weight)
+        p' = decay p + (1 - decay) (r + |weight| (1 - m)) / (1 + |weight|)    with a weight below 0
         l  = exp(-t / load_s) l',    l' = l + c
 
     The trace p summarises the latest responses: p before a response and p' after it, r the response's rank (the share
-    of all responses below it), m the mean rank of its condition. Ranks are in [0, 1], and 0 for silence; they are of
-    the response of all channels, even with several readouts. With the weight -1 the trace is how far responses have
-    been above the means of their conditions, plus 1/2. The load l is how much was stimulated in the last seconds: it
-    decays during the time t from one trial to the next, and each trial adds c, chosen so that the mean load over the
+    of all responses below it), m the mean rank of its condition; all are in [0, 1]. Ranks are of the response of all
+    channels, even with several readouts. With the weight -1 a response counts by how far it is above the mean of its
+    condition. After silence the trace is that of r = m = 0. The load l is how much was stimulated in the last seconds:
+    it decays during the time t from one trial to the next, and each trial adds c, chosen so that the mean load over the
     recording is 0.5.
 
     Attributes:
@@ -47,7 +46,7 @@ class Memory(NamedTuple):
     @property
     def silence(self) -> float:
         """The trace after silence, in which rank and mean are 0."""
-        return max(0.0, -self.weight / 2)
+        return max(0.0, -self.weight) / (1 + abs(self.weight))
 
 
 NO_MEMORY = Memory(0.0, 0.0, 1.0)
@@ -77,6 +76,7 @@ class Ranked:
         means: the mean rank of each condition's non-burst responses.
         rows: of each condition, the responses that can be drawn.
         rests: whether its trials come after silence, as a rule.
+        has_one_frequency: whether all conditions have the same.
     """
 
     def __init__(self, responses: Responses) -> None:
@@ -90,6 +90,10 @@ class Ranked:
         self.rows = [rows[known[rows]] if known[rows].any() else rows for rows in usable]
         rested = [self._presented.is_rested[self._presented.condition == c] for c in conditions]
         self.rests = np.array([len(of) > 0 and 2 * np.count_nonzero(of) > len(of) for of in rested])
+        frequencies_hz = [
+            frequency_hz for of in responses.conditions for frequency_hz in of.frequencies_hz or (np.nan,)
+        ]
+        self.has_one_frequency = len(set(frequencies_hz)) == 1 and not np.isnan(frequencies_hz[0])
 
     def traces(self, memory: Memory) -> Float64[np.ndarray, " responses"]:
         """The trace before each response."""
@@ -149,6 +153,5 @@ def trace_increment(
     rank: Float64[np.ndarray, " responses"], mean: Float64[np.ndarray, "#responses"] | float, memory: Memory
 ) -> Float64[np.ndarray, " responses"]:
     """What responses add to the trace."""
-    if memory.weight < 0:
-        return np.asarray((1 - memory.decay) * (rank + memory.weight * (mean - 0.5)))
-    return np.asarray((1 - memory.decay) * (rank + memory.weight * mean) / (1 + memory.weight))
+    weight, stimulus = abs(memory.weight), mean if memory.weight >= 0 else 1 - mean
+    return np.asarray((1 - memory.decay) * (rank + weight * stimulus) / (1 + weight))

@@ -18,10 +18,12 @@ from animat.neurons.simulator import Answer, EmpiricalSimulator, Index, Rates, S
 from animat.responses.responses import Responses
 from animat.tables import briefly
 
-_DECAYS = (0.0, 0.15, 0.3, 0.45, 0.6)
-_WEIGHTS = (-1.0, -0.75, -0.5, -0.25, 0.0, 0.5, 1.0, 2.0, 4.0)
-"""The larger ones suit few channels, whose response says less about the network than the stimulus does. Those below 0
-suit conditions of one frequency: a large response to a strong stimulus says little about the network."""
+_DECAYS = (0.0, 0.15, 0.3, 0.45)
+_WEIGHTS = (0.0, 0.5, 1.0, 2.0, 4.0)
+"""The larger ones suit few channels, whose response says less about the network than the stimulus does."""
+_DECAYS_BELOW_0 = (*_DECAYS, 0.6)
+_WEIGHTS_BELOW_0 = (-1.0, -0.75, -0.5, -0.25)
+"""For conditions of one frequency: a large response to a strong stimulus says little about the network."""
 _EXPONENTS = (0.5, 0.6, 0.7, 0.8, 0.9)
 _LOAD_S = 1.0
 """Chosen on virtual cultures 1 to 5: of 0.5, 1, 2 and 4 s it predicted the responses in their closed loops best."""
@@ -87,7 +89,8 @@ class MemorySimulator(EmpiricalSimulator):
     @property
     def silence(self) -> Scalar:
         """The trace after silence, as in `Memory`."""
-        return jnp.maximum(0.0, -jnp.asarray(self.weight) / 2)
+        weight = jnp.asarray(self.weight)
+        return jnp.maximum(0.0, -weight) / (1 + jnp.abs(weight))
 
     def answer(self, condition: Index, uniform: Scalar, history: Float[Array, "2"]) -> Answer:
         load = jnp.asarray(self.kept)[condition] * history[1]
@@ -121,14 +124,17 @@ def fit_memory(responses: Responses, *, room: int | None = None, memory: Memory 
     """Keep every condition's non-burst responses, with their histories, to draw from.
 
     The form of the trace and the neighbour exponent are found by leaving out each response in turn and predicting its
-    rank by the mean of its neighbours. Of 45 forms of the trace the one with the smallest error is taken, and of its
-    exponents the largest that is as good as the best, within one standard error of the difference. If its weight is
-    below 0, decay and weight are then those with which a linear regression of each condition's ranks over the trace
-    explains most. If no form predicts better than no history at all by two standard errors, the simulator has no
-    memory. If one does, and the times of the trials are known, a load with a time constant of one second is added if it
-    explains ranks beyond the trace (p < 0.01, F test of linear regressions).
+    rank by the mean of its neighbours. Of twenty forms of the trace the one with the smallest error is taken, and of
+    its exponents the largest that is as good as the best, within one standard error of the difference. If none predicts
+    better than no history at all by two standard errors, the simulator has no memory. If one does, and the times of the
+    trials are known, a load with a time constant of one second is added if it explains ranks beyond the trace
+    (p < 0.01, F test of linear regressions).
 
-    The decay is from 0 to 0.6, the weight from -1 to 4, the exponent from 0.5 to 0.9. How strongly the responses to a
+    If all conditions have one frequency, another twenty forms with weights below 0 are tried. If one of these is the
+    best, decay and weight are those with which regressions of each condition's ranks on the trace explain most.
+
+    The decay is from 0 to 0.45, the weight from 0 to 4, with weights from -1 to below 0 the decay up to 0.6, the
+    exponent from 0.5 to 0.9. How strongly the responses to a
     condition depend on trace and load, a slope for each, is moved towards the slopes of all conditions together, the
     less certain it is (empirical Bayes).
 
@@ -201,6 +207,9 @@ def _find_memory(ranked: Ranked) -> Memory:
 
     for form in itertools.product(_DECAYS, _WEIGHTS):
         errors |= of_form(*form)
+    if ranked.has_one_frequency:
+        for form in itertools.product(_DECAYS_BELOW_0, _WEIGHTS_BELOW_0):
+            errors |= of_form(*form)
     best = best_of(errors)
     if is_as_good(NO_MEMORY, _CERTAIN):
         return NO_MEMORY
@@ -213,17 +222,21 @@ def _find_memory(ranked: Ranked) -> Memory:
 
 
 def _refined(ranked: Ranked) -> tuple[float, float]:
-    """The decay, and the weight below 0, whose trace explains most by a regression of each condition's ranks.
+    """The decay and the weight below 0 with which regressions of each condition's ranks on the trace explain most.
 
-    By means of neighbours the choice between -1 and -0.5 is often chance, and returns depend on it.
+    Errors of neighbours' means hardly tell -1 from -0.5, and returns depend on it.
     """
 
+    # Apart from its scale the trace is linear in the weight.
+    of_ends = {of: [ranked.traces(Memory(of, end, 1.0)) for end in (0.0, -1.0)] for of in _DECAYS_BELOW_0}
+
     def explained(form: tuple[float, float]) -> float:
-        trace = ranked.traces(Memory(*form, 1.0))
+        alone, less_mean = of_ends[form[0]]
+        trace = (1 + form[1]) * alone - 2 * form[1] * less_mean
         centred = ((of[rows] - of[rows].mean() for of in (trace, ranked.rank)) for rows in ranked.rows)
         return sum(float(x @ y) ** 2 / (float(x @ x) or 1.0) for x, y in centred)
 
-    return max(itertools.product(_DECAYS, (-np.arange(1, 21) / 20).tolist()), key=explained)
+    return max(itertools.product(_DECAYS_BELOW_0, (-np.arange(1, 21) / 20).tolist()), key=explained)
 
 
 def _has_load(ranked: Ranked, memory: Memory) -> bool:

@@ -108,9 +108,9 @@ def repetition_findings(responses: Responses) -> Iterator[Finding]:
         return
     message = (
         f"responses depend on repetition: {100 * repeated.group:.0f} % pass the median where the trial before had the "
-        f"same condition, {100 * repeated.others:.0f} % where it had another (within conditions); simulators ignore "
-        "this, but policies repeat conditions often, so predicted returns may be wrong: use conditions that differ "
-        "more, as in frequency or in the number of electrodes"
+        f"same condition, {100 * repeated.others:.0f} % where it had another (within conditions); simulators know only "
+        "a part of this, and policies repeat conditions often, so predicted returns may be wrong: use conditions that "
+        "differ more, as in frequency or in the number of electrodes"
     )
     yield Finding("repetition", "warning", message, repeated.difference)
 
