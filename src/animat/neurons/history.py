@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
@@ -45,8 +45,8 @@ class Memory(NamedTuple):
 
     @property
     def silence(self) -> float:
-        """The trace after silence, in which rank and mean are 0."""
-        return max(0.0, -self.weight) / (1 + abs(self.weight))
+        """The trace after silence."""
+        return float(trace_after_silence(self.weight))
 
 
 NO_MEMORY = Memory(0.0, 0.0, 1.0)
@@ -155,3 +155,8 @@ def trace_increment(
     """What responses add to the trace."""
     weight, stimulus = abs(memory.weight), mean if memory.weight >= 0 else 1 - mean
     return np.asarray((1 - memory.decay) * (rank + weight * stimulus) / (1 + weight))
+
+
+def trace_after_silence(weight: Any) -> Any:
+    """The trace for a weight, a number or an array of any kind, if rank and mean are 0: |w| / (1 + |w|) below 0."""
+    return (abs(weight) - weight) / (2 * (1 + abs(weight)))

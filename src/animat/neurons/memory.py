@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Float64, Int, Int64
 
 from animat.arguments import checked_arguments
-from animat.neurons.history import NO_MEMORY, Memory, Ranked, trace_increment
+from animat.neurons.history import NO_MEMORY, Memory, Ranked, trace_after_silence, trace_increment
 from animat.neurons.simulator import Answer, EmpiricalSimulator, Index, Rates, Scalar, Stored, fit_empirical, to_jax
 from animat.responses.responses import Responses
 from animat.tables import briefly
@@ -89,8 +89,7 @@ class MemorySimulator(EmpiricalSimulator):
     @property
     def silence(self) -> Scalar:
         """The trace after silence, as in `Memory`."""
-        weight = jnp.asarray(self.weight)
-        return jnp.maximum(0.0, -weight) / (1 + jnp.abs(weight))
+        return jnp.asarray(trace_after_silence(self.weight))
 
     def answer(self, condition: Index, uniform: Scalar, history: Float[Array, "2"]) -> Answer:
         load = jnp.asarray(self.kept)[condition] * history[1]
