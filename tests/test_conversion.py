@@ -352,3 +352,11 @@ def test_a_date_without_a_zone_is_taken_as_utc_with_a_note(date: str, is_noted: 
     # The culture has the name that was given.
     assert written.culture is not None and written.culture == again.culture
     assert [finding.name for finding in again.findings] == [finding.name for finding in written.findings]
+
+
+def test_what_a_killed_conversion_left_is_removed_by_the_next(tmp_path: Path) -> None:
+    path = rig_file("npz", tmp_path)
+    for name in (".out.nwb.0123abcd.partial.nwb", ".other.nwb.0123abcd.partial.nwb"):
+        (tmp_path / name).write_bytes(b"half")
+    convert_recording(path, tmp_path / "out.nwb")
+    assert sorted(file.name for file in tmp_path.glob(".*")) == [".other.nwb.0123abcd.partial.nwb"]

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from animat.cli import main
+from animat.errors import Mismatch
 from animat.evaluation.transfer import timeline_differences
 from animat.neurons.timeline import fit_timeline, load_timeline, save_timeline
 from animat.recordings.conversion import Origin, convert_recording
@@ -21,7 +22,7 @@ from animat.recordings.reading import read_recording
 from animat.recordings.recorded_culture import RecordedCulture, names_in
 from animat.recordings.recording import Channels, Recording
 from animat.responses.extraction import extract_series
-from animat.responses.quality.one_culture import series_findings
+from animat.responses.quality.one_culture import series_findings, series_mismatch, unlike_finding
 from animat.responses.responses import Responses
 from animat.training.policy import Policy
 from rig_files import mapping_table, spike_table, write_cl1, write_maxwell
@@ -251,3 +252,22 @@ def test_recordings_that_overlap_in_time_cause_a_warning(start_min: float, over_
     if over_s is not None:
         assert found["recordings-overlap"].value == pytest.approx(over_s)
         assert "that at 0 min lasts 12 s longer than to the next, at 0.3 min" in found["recordings-overlap"].message
+
+
+def test_names_of_patterns_that_files_number_differently_are_no_series(tmp_path: Path) -> None:
+    rng = np.random.default_rng(5)
+    for day, names in enumerate((["left", "right"], ["right", "up"], ["right", "left"])):
+        time_s, pattern = 0.5 + 0.25 * np.arange(80), rng.choice(names, 80)
+        spikes_s = np.sort(np.concatenate([time_s + 0.005, rng.uniform(0, 20, 200)]))
+        columns = {"spike_time_s": spikes_s, "spike_channel": rng.integers(0, 4, 280), "channel_label": np.arange(4)}
+        stimuli = {"stimulus_time_s": time_s, "stimulus_pattern": pattern}
+        np.savez(tmp_path / f"{day}.npz", **columns, **stimuli, start_min=60.0 * day, duration_s=21.0)
+    first, other, same = extract_series([read_recording(tmp_path / f"{day}.npz") for day in range(3)], "pattern")
+    assert series_mismatch([first, same]) is None
+    (found,) = unlike_finding([first, other])
+    got = "got 0: left, 1: right at 0 min and 0: right, 1: up"
+    assert f"patterns: expected the same names in all recordings, {got}" in found.message
+    with pytest.raises(Mismatch, match=r"^patterns: expected the same names"):
+        fit_timeline([first, other])
+    # Not where conditions are others.
+    assert series_mismatch([replace(first, by="frequency"), replace(other, by="frequency")]) is None

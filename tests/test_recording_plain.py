@@ -756,3 +756,38 @@ def test_names_of_channels_that_look_like_numbers_stay_different(tmp_path: Path)
         assert sorted(map(str, recording.channels.label.tolist())) == labels
     (tmp_path / "a_stimuli.csv").write_text("time_s,frequency_hz,pattern\n0.05,10,1\n0.1,10,NaN\n0.15,10,\n")
     assert read_recording(tmp_path / "a_spikes.csv").stimuli.pattern.tolist() == [1, -1, -1]
+
+
+@pytest.mark.parametrize("suffix", [".CSV", ".tsv", ".txt", ".csv.gz"])
+def test_stimuli_are_beside_spikes_with_the_same_ending(suffix: str, tmp_path: Path) -> None:
+    write = gzip.compress if suffix.endswith(".gz") else bytes
+    (tmp_path / f"a_spikes{suffix}").write_bytes(write(b"time_s\tchannel\n0.1\t3\n0.2\t4\n"))
+    with_none = read_recording(tmp_path / f"a_spikes{suffix}")
+    (message,) = [f.message for f in with_none.findings if f.name == "no-stimuli"]
+    assert f"a_stimuli{suffix} or " in message
+    (tmp_path / f"a_stimuli{suffix}").write_bytes(write(b"time_s\n0.15\n"))
+    assert read_recording(tmp_path / f"a_spikes{suffix}").stimuli.time_s.tolist() == [0.15]
+
+
+@pytest.mark.parametrize(
+    ("stimuli", "words"),
+    [
+        ("time_s,presentation\n0,2\n0.1,1\n", "a_stimuli.csv: stimulus_presentation: expected numbers that never fall"),
+        ("time_s,presentation\n0,1\n0.1,1.5\n", "a_stimuli.csv, line 3: stimulus_presentation: expected whole numbers"),
+        ("time_s,pattern\n0,0\n0.1,0.5\n", "a_stimuli.csv, line 3: stimulus_pattern: expected whole numbers or names"),
+        ("time_s,electrodes\n0,4\n0.1,-5\n", "a_stimuli.csv: stimulus_electrodes: expected electrode numbers"),
+    ],
+)
+def test_errors_on_stimuli_name_their_file(stimuli: str, words: str, tmp_path: Path) -> None:
+    (tmp_path / "a_spikes.csv").write_text("time_s,channel\n0.1,3\n0.2,4\n")
+    (tmp_path / "a_stimuli.csv").write_text(stimuli)
+    with pytest.raises(InvalidFile, match=words):
+        read_recording(tmp_path / "a_spikes.csv")
+
+
+@pytest.mark.parametrize(
+    "labels", [("9007199254740992", "9007199254740993"), ("inf", "3"), ("12345678901234567890", "1")]
+)
+def test_channels_that_no_float_tells_apart_are_names(labels: tuple[str, str], tmp_path: Path) -> None:
+    (tmp_path / "a_spikes.csv").write_text(f"time_s,channel\n0.1,{labels[0]}\n0.2,{labels[1]}\n")
+    assert sorted(read_recording(tmp_path / "a_spikes.csv").channels.label.tolist()) == sorted(labels)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import gzip
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from animat.cli import main
-from animat.errors import AnimatError, InvalidFile
+from animat.errors import AnimatError, InvalidFile, Mismatch
 from animat.recordings.quality import recording_findings
 from animat.recordings.reading import read_recording, read_source, read_sources
 from animat.recordings.recording import Recording, ResponseTable
@@ -317,3 +318,70 @@ def test_the_trials_of_a_wide_table_are_known(tmp_path: Path) -> None:
     assert table.values.tolist() == [[3, 4], [5, 6]]
     (ignored,) = [finding.message for finding in table.findings if "mood" in finding.message]
     assert "trial" not in ignored
+
+
+def test_a_window_that_is_given_is_no_assumption_even_if_it_is_the_usual_one(tmp_path: Path) -> None:
+    counts: dict[str, Any] = {"response_count": [[1, 0], [0, 0]], "stimulus_pattern": [0, 1]}
+    np.savez(tmp_path / "unstated.npz", **counts)
+    np.savez(tmp_path / "stated.npz", response_window_ms=[5, 25], **counts)
+    unstated, stated = (table_of(tmp_path / f"{name}.npz") for name in ("unstated", "stated"))
+
+    def severities(window_ms: tuple[float, float] | None) -> list[str]:
+        found = extract_responses(unstated, ByPattern(), window_ms).findings
+        return [f.severity for f in found if f.name == "window-assumed"]
+
+    assert (severities(None), severities((2.0, 10.0))) == (["warning"], ["note"])
+    assert extract_responses(stated, ByPattern()).window_ms == (5.0, 25.0)
+    with pytest.raises(Mismatch, match="expected 5 to 25, in which the table's spikes were counted, got 2 to 10"):
+        extract_responses(stated, ByPattern(), (2.0, 10.0))
+
+
+def test_numbered_trials_are_in_the_order_of_their_numbers_and_missing_ones_are_counted(tmp_path: Path) -> None:
+    rng = np.random.default_rng(4)
+    values = rng.poisson(0.4, (60, 3))
+    # As exported by many programs: without zeros, sorted by channel. The first and the last trial are there.
+    values[[0, -1], 1] = 1
+    lines = [f"{trial + 101},{c},{n},{trial % 2}" for c, of in enumerate(values.T) for trial, n in enumerate(of) if n]
+    (tmp_path / "a_responses.csv").write_text("\n".join(["trial,channel,count,pattern", *lines]) + "\n")
+    table = table_of(tmp_path / "a_responses.csv")
+    some = values.any(axis=1)
+    np.testing.assert_array_equal(table.values, values[some])
+    np.testing.assert_array_equal(table.stimuli.pattern, np.flatnonzero(some) % 2)
+    (found,) = [f for f in table.findings if f.name == "trials-missing"]
+    assert (found.severity, found.value) == ("warning", float(np.count_nonzero(~some)))
+    assert f"{np.count_nonzero(~some)} of the trials 101 to 160 have no line" in found.message
+    # Names have no order but that of the file.
+    named = [f"t{line}" for line in lines]
+    (tmp_path / "b_responses.csv").write_text("\n".join(["trial,channel,count,pattern", *named]) + "\n")
+    other = table_of(tmp_path / "b_responses.csv")
+    assert len(other.values) == some.sum() and not np.array_equal(other.values, values[some])
+    assert not [f for f in other.findings if f.name == "trials-missing"]
+
+
+@pytest.mark.parametrize(
+    ("changed", "name", "severity"),
+    [
+        ({"scale": 1000.0}, "times-not-in-seconds", "refuse"),
+        ({"scale": 0.0}, "simultaneous-stimuli", "refuse"),
+        ({"order": "blocked"}, "other-order", "warning"),
+        ({"window_ms": [2.0, 80.0]}, "stimuli-too-close", "warning"),
+        ({}, None, ""),
+    ],
+)
+def test_stimuli_of_a_table_are_checked_like_those_of_spikes(
+    changed: dict[str, Any], name: str | None, severity: str, tmp_path: Path
+) -> None:
+    frequency_hz = np.random.default_rng(2).choice([5.0, 10.0, 20.0], 300)
+    time_s = np.cumsum(1 / frequency_hz) * changed.get("scale", 1.0)
+    window_ms, order = changed.get("window_ms", [2.0, 10.0]), changed.get("order", "mixed")
+    of_stimuli = {"stimulus_time_s": time_s, "stimulus_frequency_hz": frequency_hz}
+    counts = np.random.default_rng(3).poisson(1.0, (300, 8))
+    presented = {"presentation_order": order, "presentation_pulses": 1}
+    np.savez(tmp_path / "a.npz", response_count=counts, response_window_ms=window_ms, **of_stimuli, **presented)
+    table = table_of(tmp_path / "a.npz")
+    found = {f.name: f.severity for f in (*recording_findings(table), *extract_responses(table).findings)}
+    wanted = {"times-not-in-seconds", "simultaneous-stimuli", "other-order", "stimuli-too-close"}
+    if name is None:
+        assert not wanted & set(found)
+    else:
+        assert found[name] == severity

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 import stand_in_cl
 import stand_in_maxlab
 from animat.cli import main
+from animat.cli.record import _plan
 from animat.closed_loop.agents import Agent, AnyCondition
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.running import run_session
@@ -32,6 +33,7 @@ from animat.recordings.recording import Recording
 from animat.responses.condition import RESTING, Condition
 from animat.responses.conditions import ByElectrode, ByPattern
 from animat.responses.extraction import extract_responses
+from animat.responses.inspection import inspect_recording
 from animat.robots import Navigation
 from animat.stimulation.places import NONE, check_places
 from animat.stimulation.protocol import Protocol
@@ -261,3 +263,18 @@ def test_no_rest_is_sent_to_a_maxone(tmp_path: Path, monkeypatch: pytest.MonkeyP
     session = read_session(tmp_path)
     assert session.ending.by == "plan", session.ending.message
     assert len(rig.delivered) == 3 * (12 + sum(tick.delivered for tick in session.ticks))
+
+
+def test_inspection_and_plan_count_what_is_delivered() -> None:
+    culture = small_culture()
+    with culture:
+        sites = culture.stimulation_electrodes[:8]
+    recording = recorded(culture, NONE, sites)
+    inspection = inspect_recording(recording)
+    assert (inspection.n_stimuli, inspection.n_trials) == (12, 24)
+    times_s = recording.stimuli.time_s[~recording.stimuli.is_rest]
+    spikes_s = recording.spike_times_s
+    counts = [np.count_nonzero((spikes_s >= t + 0.002) & (spikes_s < t + 0.01)) for t in times_s]
+    assert inspection.mean_spikes_per_stimulus == pytest.approx(np.mean(counts), abs=0.2)
+    plan = _plan(Protocol((20.0,), "mixed", trials=12, places=(NONE, (1, 2))), 1, 10.0)
+    assert "with 12 stimuli each" in plan

@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from animat.responses.conditions import Conditions
     from animat.responses.inspection import Inspection
     from animat.responses.responses import Responses
-    from animat.responses.windows import Window
 
 
 @dataclass(frozen=True)
@@ -45,7 +44,7 @@ class Inspect(ResponseOptions):
         from animat.report.inspection import expect_unique_stems
         from animat.responses.bursts import check_threshold
         from animat.responses.conditions import conditions_named
-        from animat.responses.windows import DEFAULT_WINDOW_MS, check_window
+        from animat.responses.windows import check_window
         from animat.robots.grid import grid_for
         from animat.robots.registry import robot_named
 
@@ -55,8 +54,8 @@ class Inspect(ResponseOptions):
             except InvalidArgument as error:
                 raise InvalidArgument(f"--optimum: {str(error).removeprefix('robot: ')}") from error
         by = None if self.conditions is None else conditions_named(self.conditions)
-        window_ms = self.window_ms or DEFAULT_WINDOW_MS
-        check_window(window_ms)
+        if self.window_ms is not None:
+            check_window(self.window_ms)
         check_threshold(self.burst_threshold)
         files = list_recordings(self.recordings)
         if self.out is not None:
@@ -72,7 +71,7 @@ class Inspect(ResponseOptions):
             for number, file in enumerate(files):
                 progress.update(steps * number, total, file.name)
                 try:
-                    source, inspection = self._inspect(file, by, window_ms)
+                    source, inspection = self._inspect(file, by)
                 except AnimatError as error:
                     if len(files) == 1:
                         raise
@@ -95,15 +94,13 @@ class Inspect(ResponseOptions):
             print(f"animat: {len(unreadable)} of {len(files)} files could not be inspected{others}", file=sys.stderr)
         return results
 
-    def _inspect(
-        self, file: Path, by: Conditions | None, window_ms: Window
-    ) -> tuple[Recording | ResponseTable, Inspection]:
+    def _inspect(self, file: Path, by: Conditions | None) -> tuple[Recording | ResponseTable, Inspection]:
         from animat.recordings.reading import read_source
         from animat.responses.inspection import inspect_recording
 
         source = read_source(file, stimuli=self.stimuli, part=self.part)
         with within(file, (UnusableData, Mismatch)):
-            return source, inspect_recording(source, by, window_ms, self.burst_threshold, file.name)
+            return source, inspect_recording(source, by, self.window_ms, self.burst_threshold, file.name)
 
     def _show(self, source: Recording | ResponseTable, inspection: Inspection, progress: Progress) -> dict[str, Any]:
         """Print what was found in a file, and draw its figures; returns it for JSON."""
@@ -135,7 +132,7 @@ class Inspect(ResponseOptions):
             drawn = draw_series(recording, series, out)
         except Mismatch as unlike:
             print(f"no figures of the series: {unlike}")
-            return {}
+            return {"figures": []}
         if drawn:
             of = "figures of the series" if len(files) > 1 else "figure of the array"
             print(f"{of}: {', '.join(map(str, drawn))}")

@@ -169,8 +169,11 @@ def _print_findings(files: Iterable[Path]) -> None:
 def _plan(protocol: Protocol, sessions: int, interval_min: float) -> str:
     """What a device is about to deliver, in a line."""
     from animat.cultures.series import minutes_of
+    from animat.stimulation.places import NONE
 
-    pulses = len(protocol.frequencies_hz) * protocol.trials * protocol.pulses * max(1, protocol.n_places)
+    # In a rest nothing is delivered.
+    places = protocol.n_places - (NONE in protocol.places) if protocol.places else 1
+    pulses = len(protocol.frequencies_hz) * protocol.trials * protocol.pulses * places
     series = f"{counted(sessions, 'recording')} of {minutes_of(protocol):.1f} min"
     if sessions > 1:
         series += f", one every {interval_min:g} min"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 import os
 import re
 from collections.abc import Callable
@@ -24,6 +25,7 @@ from animat.recordings.metadata import LIKE_A_DATE, culture_of, date_of
 from animat.recordings.raw import RawTraces
 from animat.recordings.reading import HDF5, TEXT_NAMES, ZIP, first_bytes, read_recording
 from animat.recordings.recording import Recording
+from animat.writing import clear_leftovers
 
 _DATE, _TIME = ("".join(rf"(?:(\d+(?:\.\d+)?){unit})?" for unit in units) for units in ("YMWD", "HMS"))
 DURATION = re.compile(rf"P(?=.){_DATE}(?:T(?=\d){_TIME})?", re.ASCII)
@@ -149,6 +151,7 @@ def convert_recording(
         message = f"recorded_at {date} has no time zone and is taken as UTC; add one, such as +09:00"
         findings += (Finding("zone-unknown", "note", message),)
     recording = replace(recording, provenance=provenance, start_min=float(start_min), findings=findings, **read)
+    clear_leftovers(out.parent, glob.escape(out.name))
     write_nwb(recording, out)
     return recording
 

@@ -9,7 +9,7 @@ import numpy as np
 from animat.errors import counted, some_of
 from animat.recordings.findings import Finding
 from animat.recordings.recording import Recording, ResponseTable
-from animat.recordings.time_quality import frequency_findings, silence_findings, time_findings
+from animat.recordings.time_quality import common_factor, frequency_findings, silence_findings, time_findings
 from animat.stimulation.frequency import is_same
 from animat.tables import UNKNOWN
 
@@ -35,12 +35,19 @@ PITCH_UM = 2.0, 20_000.0
 def recording_findings(recording: Recording | ResponseTable) -> tuple[Finding, ...]:
     """All findings about a recording (docs/recordings.md lists them): those from its file, then those in its data.
 
-    For a response table, which has no spikes, only the former and those on its frequencies (`other-frequencies`).
+    For a response table, which has no spikes, only the former and those on its stimuli.
     """
-    if isinstance(recording, ResponseTable):
-        return (*recording.findings, *frequency_findings(recording.stimuli, has_times=recording.has_times))
+    found = _in_table(recording) if isinstance(recording, ResponseTable) else _in_data(recording)
     known = {finding.name for finding in recording.findings}
-    return (*recording.findings, *(finding for finding in _in_data(recording) if finding.name not in known))
+    return (*recording.findings, *(finding for finding in found if finding.name not in known))
+
+
+def _in_table(table: ResponseTable) -> Iterable[Finding]:
+    if table.has_times and (stated := common_factor(table.stimuli)) is not None:
+        yield stated
+    else:
+        yield from frequency_findings(table.stimuli, has_times=table.has_times)
+    yield from _stimulus_rows(table)
 
 
 def _in_data(recording: Recording) -> Iterable[Finding]:
@@ -59,6 +66,11 @@ def _in_data(recording: Recording) -> Iterable[Finding]:
         message = f"no spikes can be detected at a sampling rate of {recording.sampling_rate_hz:g} Hz: is it in kHz?"
         yield Finding("sampling-rate", "warning", message, recording.sampling_rate_hz)
     yield from _duplicates(recording)
+    n_spikes = len(recording.spike_times_s)
+    if len(stimuli) >= MANY_STIMULI and 0 < n_spikes < len(stimuli):
+        ratio = len(stimuli) / n_spikes
+        message = f"{len(stimuli):,} stimuli for {n_spikes:,} spikes: are spikes and stimuli swapped?"
+        yield Finding("more-stimuli-than-spikes", "refuse" if ratio >= STIMULI_PER_SPIKE else "note", message, ratio)
     yield from _stimulus_rows(recording)
     if unknown := int(np.count_nonzero(np.all(stimuli.electrodes == UNKNOWN, axis=1) & ~stimuli.is_rest)):
         message = f"the electrodes of {unknown:,} of {len(stimuli):,} stimuli are not known; a replay needs them"
@@ -69,13 +81,9 @@ def _in_data(recording: Recording) -> Iterable[Finding]:
         yield Finding("presentation-unknown", "note", message)
 
 
-def _stimulus_rows(recording: Recording) -> Iterable[Finding]:
+def _stimulus_rows(recording: Recording | ResponseTable) -> Iterable[Finding]:
     """Findings on rows of the stimulus table that are not single stimuli."""
-    n_spikes, times_s = len(recording.spike_times_s), recording.stimuli.time_s
-    if len(times_s) >= MANY_STIMULI and 0 < n_spikes < len(times_s):
-        ratio = len(times_s) / n_spikes
-        message = f"{len(times_s):,} stimuli for {n_spikes:,} spikes: are spikes and stimuli swapped?"
-        yield Finding("more-stimuli-than-spikes", "refuse" if ratio >= STIMULI_PER_SPIKE else "note", message, ratio)
+    times_s = recording.stimuli.time_s
     yield from _unlike_stated_order(recording)
     last = recording.stimuli.is_last_of_presentation
     if same := int(np.count_nonzero((np.diff(times_s) == 0) & last[:-1])):
@@ -94,7 +102,7 @@ def _stimulus_rows(recording: Recording) -> Iterable[Finding]:
         yield Finding("trials-of-several-frequencies", "warning", message, float(several))
 
 
-def _unlike_stated_order(recording: Recording) -> Iterator[Finding]:
+def _unlike_stated_order(recording: Recording | ResponseTable) -> Iterator[Finding]:
     """A finding on trials whose frequencies are not in the stated order; those of a protocol are."""
     frequency_hz = recording.stimuli.frequency_hz[recording.stimuli.is_last_of_presentation]
     frequency_hz = frequency_hz[~np.isnan(frequency_hz)]

@@ -5,6 +5,7 @@ A gap without any event, before the first one or between spikes, is too long to 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 
 import numpy as np
@@ -65,7 +66,7 @@ def time_findings(recording: Recording) -> Iterator[Finding]:
     Any other common factor above 30 or below 1/30 is a warning only: trains of 100 pulses, one row each, have intervals
     100 times as long as stated. Stimuli that come later than stated may have pauses between them.
     """
-    stated = _common_factor(recording.stimuli, recording.sampling_rate_hz)
+    stated = common_factor(recording.stimuli, recording.sampling_rate_hz)
     if stated is not None and stated.severity == "refuse":
         yield stated
     elif (reason := _impossible_firing(recording) or _separate_clocks(recording)) is not None:
@@ -103,7 +104,7 @@ def _multiples(stimuli: Stimuli) -> Iterator[dict[float, Float64[np.ndarray, " i
         yield dict(zip(stated_hz.tolist(), of_each[: len(stated_hz)], strict=True))
 
 
-def _common_factor(stimuli: Stimuli, sampling_rate_hz: float) -> Finding | None:
+def common_factor(stimuli: Stimuli, sampling_rate_hz: float = math.nan) -> Finding | None:
     """A finding if all intervals are the same multiple of those of the stated frequencies."""
     for multiples_of in _multiples(stimuli):
         if not multiples_of or max(multiples_of) < APART * min(multiples_of):

@@ -44,7 +44,7 @@ _NOTHING_TO_FIT = ("no-stimuli", "no-condition", "empty-condition")
 def extract_responses(
     source: Recording | ResponseTable,
     by: Conditions | str | None = None,
-    window_ms: Window = DEFAULT_WINDOW_MS,
+    window_ms: Window | None = None,
     burst_threshold: float | None = None,
     readouts: str | Readouts = ALL,
 ) -> Responses:
@@ -62,8 +62,8 @@ def extract_responses(
     Args:
         source: spikes, or the response of each channel to each stimulus.
         by: the conditions, or their text form (`conditions_named`); None: by frequency, or places if there are any.
-        window_ms: start and end of the window after the pulse. A table that states its window replaces the default; for
-            one that does not, this is the window in which its spikes were counted.
+        window_ms: start and end of the window after the pulse; None: a table's own window, otherwise the paper's, 2 to
+            10 ms. For a table that does not state its window, this is the one in which its spikes were counted.
         burst_threshold: a ratio of active channels to use in place of Otsu's threshold; 1 keeps every response.
         readouts: groups of channels whose x is read too, or `halves` or `quadrants`; bursts are those of all channels.
 
@@ -74,7 +74,8 @@ def extract_responses(
 
     Source: the paper's methods (2-10 ms, x = S_total / (T N), Otsu's threshold, here only where it finds two groups).
     """
-    window_ms = check_window(window_ms)
+    given_ms = None if window_ms is None else check_window(window_ms)
+    window_ms = given_ms or DEFAULT_WINDOW_MS
     stimuli, n_channels = source.stimuli, len(source.channels)
     if not n_channels:
         what = "recording" if isinstance(source, Recording) else "table"
@@ -90,7 +91,7 @@ def extract_responses(
     # Whether the window after each stimulus ends within the recording; of a table, all do.
     inside = np.ones(len(stimuli), np.bool_)
     if isinstance(source, ResponseTable):
-        window_ms, assumed = _window_of(source, by, window_ms)
+        window_ms, assumed = _window_of(source, by, given_ms)
     else:
         # 1e-9: the end of the recording may be the rounded time of its last stimulus or spike.
         inside = stimuli.time_s + window_ms[1] * 1e-3 <= _observed_until_s(source, begins) + 1e-9
@@ -126,6 +127,7 @@ def extract_responses(
         by=str(by),
         burst_threshold=burst_threshold,
         culture=source.culture,
+        pattern_names=source.provenance.get("patterns"),
         channels=source.channels,
         readouts=readouts,
         readout_hz=None if readouts.are_all else _read_groups(source, presented[chosen], window_ms, readouts),
@@ -179,20 +181,21 @@ def _observed_until_s(recording: Recording, begins: Bool[np.ndarray, " stimuli"]
     return until_s
 
 
-def _window_of(table: ResponseTable, by: Conditions, window_ms: Window) -> tuple[Window, tuple[Finding, ...]]:
+def _window_of(table: ResponseTable, by: Conditions, given_ms: Window | None) -> tuple[Window, tuple[Finding, ...]]:
     """The window in which a table's spikes were counted, and a finding if the table does not state it."""
-    if table.window_ms is not None and window_ms not in (DEFAULT_WINDOW_MS, table.window_ms):
+    if isinstance(by, ByInterval) and not table.has_times:
+        raise UnusableData("conditions: expected no intervals, as the table has no stimulus times")
+    window_ms = given_ms or DEFAULT_WINDOW_MS
+    if table.window_ms is not None and given_ms not in (None, table.window_ms):
         raise Mismatch(
             f"window_ms: expected {table.window_ms[0]:g} to {table.window_ms[1]:g}, in which the table's spikes were "
             f"counted, got {window_ms[0]:g} to {window_ms[1]:g}; leave the window out"
         )
-    if isinstance(by, ByInterval) and not table.has_times:
-        raise UnusableData("conditions: expected no intervals, as the table has no stimulus times")
     if table.window_ms is not None:
         return table.window_ms, ()
     unstated = "the table does not state the window in which its spikes were counted"
     after = f"{window_ms[0]:g} to {window_ms[1]:g} ms after the stimulus"
-    if window_ms != DEFAULT_WINDOW_MS:
+    if given_ms is not None:
         return window_ms, (Finding("window-assumed", "note", f"{unstated}: {after} were given"),)
     in_a_loop = f"{after} is assumed, in which a closed loop would count them; give it with --window-ms, or in the file"
     return window_ms, (Finding("window-assumed", "warning", f"{unstated}: {in_a_loop}"),)
@@ -212,8 +215,7 @@ def extract_series(
 
     Args:
         recordings: of one culture; or response tables.
-        by, burst_threshold: as in `extract_responses`.
-        window_ms: start and end of the window after the pulse; None: the paper's, 2 to 10 ms.
+        by, window_ms, burst_threshold: as in `extract_responses`.
         allow: names of findings (`"dead-window"`) to ignore.
         readouts: groups of channels, the same electrodes in all; `halves` and `quadrants` are those of the first.
 
@@ -224,7 +226,6 @@ def extract_series(
     """
     check_allowed(allow)
     by = conditions_named(by) if isinstance(by, str) else by
-    window_ms = DEFAULT_WINDOW_MS if window_ms is None else window_ms
     series = []
     for recording in recordings:
         try:

@@ -19,7 +19,7 @@ from animat.responses.conditions import Conditions
 from animat.responses.extraction import extract_responses
 from animat.responses.psth import ResponseTime, find_response, spontaneous_rate
 from animat.responses.responses import Responses
-from animat.responses.windows import DEFAULT_WINDOW_MS, Window
+from animat.responses.windows import Window
 from animat.tables import briefly
 
 Verdict = Literal["usable", "usable with care", "not usable"]
@@ -138,7 +138,7 @@ class Inspection:
 def inspect_recording(
     recording: Recording | ResponseTable,
     by: Conditions | str | None = None,
-    window_ms: Window = DEFAULT_WINDOW_MS,
+    window_ms: Window | None = None,
     burst_threshold: float | None = None,
     name: str | None = None,
 ) -> Inspection:
@@ -157,6 +157,10 @@ def inspect_recording(
     stimuli, (presented, _) = recording.stimuli, responses.presentations
     # Channels times the length of a window.
     window_s = (responses.window_ms[1] - responses.window_ms[0]) * 1e-3 * responses.n_channels
+    # Nothing was delivered in a rest.
+    pulses_s, rates_hz = stimuli.time_s[~stimuli.is_rest], presented.rate_hz
+    if presented.time_s is not None:
+        rates_hz = rates_hz[np.isin(presented.time_s, pulses_s)]
     bursts = response = None
     rate_hz = duration_s = math.nan
     if isinstance(recording, ResponseTable):
@@ -166,7 +170,7 @@ def inspect_recording(
             duration_s = float(np.ptp(stimuli.time_s))
     else:
         kind, n_spikes, duration_s = "recording", len(recording.spike_times_s), recording.duration_s
-        rate_hz = spontaneous_rate(recording, after_ms=window_ms[1])[0] / len(recording.channels)
+        rate_hz = spontaneous_rate(recording, after_ms=responses.window_ms[1])[0] / len(recording.channels)
         if not len(stimuli):
             bursts = find_network_bursts(recording)
             exposure_s = recording.duration_s * len(recording.channels)
@@ -175,11 +179,11 @@ def inspect_recording(
     return Inspection(
         name=name or recording.provenance.get("source", kind),
         n_spikes=n_spikes,
-        n_stimuli=len(stimuli),
+        n_stimuli=len(pulses_s),
         n_trials=int(np.count_nonzero(stimuli.is_last_of_presentation)),
         duration_s=duration_s,
         by_default=by is None,
-        mean_spikes_per_stimulus=float(np.mean(presented.rate_hz)) * window_s if len(presented.rate_hz) else math.nan,
+        mean_spikes_per_stimulus=float(np.mean(rates_hz)) * window_s if len(rates_hz) else math.nan,
         spontaneous_rate_hz=rate_hz,
         response=response,
         responses=responses,

@@ -69,6 +69,7 @@ class Responses:
         by: the rule that sorted stimuli into conditions, as `conditions_named` reads it; None if it is not known.
         burst_threshold: the given threshold; None: it is Otsu's.
         culture, recorded_at: which was recorded, and when; None if it is not known.
+        pattern_names: the file's names for numbers of patterns; None if it has none.
         channels: those over which x is a mean; None if they are not known.
         readouts: the groups of channels read; by default all channels as one.
         readout_hz: x of each readout, shape (responses, readouts), or (responses,) for one; None: it is `rate_hz`.
@@ -100,6 +101,7 @@ class Responses:
     burst_threshold: float | None = None
     culture: RecordedCulture | None = None
     recorded_at: datetime | None = None
+    pattern_names: str | None = None
     channels: Channels | None = None
     readouts: Readouts = ALL
     readout_hz: Float64[np.ndarray, "responses *readouts"] | None = None

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from animat.errors import InvalidFile, counted, did_you_mean, in_file, some_of
+from animat.errors import InvalidArgument, InvalidFile, UnusableData, counted, did_you_mean, in_file, some_of
 from animat.recordings.columns import REQUIRED, Column, PlainColumns
 from animat.recordings.findings import Finding
 from animat.recordings.formats.text_table import TextTable, as_numbers, folded, is_number, read_table, whole_numbers
@@ -30,7 +31,6 @@ STIMULUS_COLUMNS = {
 }
 NAMES = ("spike_channel", "stimulus_pattern")
 """Columns that may be text."""
-SUFFIXES = (".csv", ".csv.gz")
 
 
 def read_csv(table: TextTable, stimuli_path: str | os.PathLike[str] | None = None) -> Recording:
@@ -54,16 +54,29 @@ def read_csv(table: TextTable, stimuli_path: str | os.PathLike[str] | None = Non
         message = f"{path.name} has {found}: {looked_for} was looked for; rename the stimulus file accordingly"
         findings = [*findings, Finding("no-stimuli", "refuse", message)]
     else:
-        stimulus_table = read_table(stimuli, "stimulus_time_s")
-        columns |= _known_columns(stimulus_table, STIMULUS_COLUMNS)
-        findings = [*findings, *stimulus_table.findings]
+        of_stimuli, found_there = read_stimuli_csv(stimuli)
+        columns |= of_stimuli
+        findings = [*findings, *found_there]
         provenance["stimuli"] = stimuli.name
-    return PlainColumns(**columns).to_recording(provenance, tuple(findings))
+    with in_stimulus_file(stimuli):
+        return PlainColumns(**columns).to_recording(provenance, tuple(findings))
 
 
-def read_stimuli_csv(path: Path) -> dict[str, Any]:
-    """The stimulus columns of `PlainColumns` in a stimulus file; unknown columns are left out."""
-    return _known_columns(read_table(path, "stimulus_time_s"), STIMULUS_COLUMNS)
+def read_stimuli_csv(path: Path) -> tuple[dict[str, Any], list[Finding]]:
+    """The stimulus columns of `PlainColumns` in a stimulus file, and findings, as on unknown columns."""
+    table = read_table(path, "stimulus_time_s")
+    return _known_columns(table, STIMULUS_COLUMNS), table.findings
+
+
+@contextmanager
+def in_stimulus_file(path: Path | None) -> Iterator[None]:
+    """Name the stimulus file in errors on its columns, which become a recording together with another file's."""
+    try:
+        yield
+    except (InvalidArgument, UnusableData) as error:
+        if path is None or not str(error).startswith("stimulus_"):
+            raise
+        raise InvalidFile(f"{path}: {error}") from error
 
 
 def stimuli_beside(path: Path) -> Path | None:
@@ -73,11 +86,13 @@ def stimuli_beside(path: Path) -> Path | None:
 
 def _stimuli_beside(path: Path) -> list[Path]:
     name = _stem(path).removesuffix("_spikes")
-    return [path.with_name(f"{name}_stimuli{suffix}") for suffix in SUFFIXES]
+    # Its own suffix first, such as .tsv.
+    suffixes = dict.fromkeys([path.name[len(_stem(path)) :], ".csv", ".csv.gz"])
+    return [path.with_name(f"{name}_stimuli{suffix}") for suffix in suffixes if suffix]
 
 
 def _stem(path: Path) -> str:
-    return path.name.removesuffix(".gz").removesuffix(".csv")
+    return re.sub(r"\.(csv|tsv|txt)(\.gz)?$", "", path.name, flags=re.IGNORECASE)
 
 
 def _known_columns(table: TextTable, known: Mapping[str, tuple[str, ...]]) -> dict[str, Any]:
@@ -134,6 +149,9 @@ def plain_column(table: TextTable, place: int, name: str) -> Column:
         if name == "stimulus_frequency_hz" and np.any(numbers <= 0):
             row = int(np.flatnonzero(numbers <= 0)[0])
             raise table.wrong(row, f"{name}: expected positive frequencies in Hz, or nothing, got {numbers[row]:g}")
+        if name == "stimulus_presentation" and np.any(wrong := numbers > np.floor(numbers)):
+            row = int(np.argmax(wrong))
+            raise table.wrong(row, f"{name}: expected whole numbers, got {numbers[row]:g}")
         return numbers
     cells = table.text(place)
     if name in REQUIRED and "" in cells:
@@ -144,13 +162,14 @@ def plain_column(table: TextTable, place: int, name: str) -> Column:
     except ValueError:
         return np.array(cells, dtype=np.str_)
     named = {cell for cell, number in zip(cells, numbers.tolist(), strict=True) if number == number}
-    if len({*as_numbers([*named]).tolist()}) < len({re.sub(r"\.0*$", "", name.strip()) for name in named}):
-        # Names that look like numbers, such as 01 beside 1.
+    are_alike = len({*as_numbers([*named]).tolist()}) < len({re.sub(r"\.0*$", "", name.strip()) for name in named})
+    if are_alike or np.any(np.abs(numbers) >= 2**53):
+        # Names that look like numbers, such as 01 beside 1, inf, or serial numbers that floats do not represent.
         return np.array(cells, dtype=np.str_)
-    if name == "spike_channel" and np.any(wrong := numbers % 1 > 0):
-        row = int(np.flatnonzero(wrong)[0])
-        swapped = "are the columns of times and channels swapped?"
-        raise table.wrong(row, f"{name}: expected whole numbers or names, got {cells[row]}: {swapped}")
+    if np.any(wrong := numbers > np.floor(numbers)):
+        row = int(np.argmax(wrong))
+        swapped = ": are the columns of times and channels swapped?" if name == "spike_channel" else ""
+        raise table.wrong(row, f"{name}: expected whole numbers or names, got {cells[row]}{swapped}")
     return numbers
 
 

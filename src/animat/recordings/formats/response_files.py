@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from animat.recordings.columns import Column, PlainColumns
 from animat.recordings.findings import Finding, left_out_findings
 from animat.recordings.formats.csv import SPIKE_COLUMNS, STIMULUS_COLUMNS, nearest, plain_column
 from animat.recordings.formats.npz import KEYS, load_columns
-from animat.recordings.formats.text_table import TextTable, folded
+from animat.recordings.formats.text_table import TextTable, as_numbers, folded
 from animat.recordings.recording import ResponseKind, ResponseTable
 
 KINDS: tuple[ResponseKind, ...] = ("count", "rate_hz")
@@ -74,6 +75,7 @@ def read_response_table(table: TextTable) -> ResponseTable | None:
     if not _is_response_table(table):
         return None
     is_long = table.place(("channel",)) is not None
+    table = _by_trial(table) if is_long else table
     values, kind, labels, first_of = _read_long(table) if is_long else _read_wide(table)
     columns: dict[str, Any] = {"channel_label": labels}
     for name, names in TABLE_COLUMNS.items():
@@ -109,6 +111,25 @@ def _read_wide(table: TextTable) -> _Read:
 def _label(head: str, kind: ResponseKind) -> str:
     """The part of a header after the kind, such as 12 in `Rate (Hz) 12`."""
     return next(head[i:].strip() for i in range(len(head) + 1) if folded(f"{head[:i]}x") == f"{kind}_x")
+
+
+def _by_trial(table: TextTable) -> TextTable:
+    """A long table in the order of its trials if they are numbered, and a finding on numbers without a line."""
+    place = table.place((TRIAL,))
+    try:
+        numbers = np.empty(0) if place is None else as_numbers(table.text(place))
+    except ValueError:
+        return table
+    if not len(numbers) or not np.array_equal(numbers, np.floor(numbers)) or np.any(np.isinf(numbers)):
+        return table
+    first, last = numbers.min(), numbers.max()
+    if missing := int(last - first) + 1 - len(np.unique(numbers)):
+        numbered = f"{missing:,} of the trials {first:.0f} to {last:.0f} have no line"
+        remedy = "if these are trials without a spike, add a line with 0 for each"
+        message = f"{numbered}, and are left out as if they had never been: {remedy}"
+        table.findings.append(Finding("trials-missing", "warning", message, float(missing)))
+    order = np.argsort(numbers, kind="stable").tolist()
+    return replace(table, rows=[table.rows[row] for row in order], lines=[table.lines[row] for row in order])
 
 
 def _read_long(table: TextTable) -> _Read:

@@ -19,7 +19,7 @@ from jaxtyping import Float32
 from animat.errors import InvalidArgument, InvalidFile, first_line
 from animat.extras import install_command
 from animat.recordings.columns import PlainColumns, recorded_span
-from animat.recordings.formats.csv import read_stimuli_csv, stimuli_beside
+from animat.recordings.formats.csv import in_stimulus_file, read_stimuli_csv, stimuli_beside
 from animat.recordings.raw import RawTraces, in_microvolts
 from animat.recordings.recording import Recording
 
@@ -50,11 +50,13 @@ def open_with_spikeinterface(
     if segments != 1:
         raise InvalidFile(f"{path}: expected one segment of traces, got {segments}; export them one by one")
     pulses = Path(stimuli_path) if stimuli_path is not None else stimuli_beside(path.with_name(f"{path.stem}.csv"))
-    columns: dict[str, Any] = {"stimulus_time_s": np.empty(0)} if pulses is None else read_stimuli_csv(pulses)
+    columns: dict[str, Any]
+    columns, findings = ({"stimulus_time_s": np.empty(0)}, []) if pulses is None else read_stimuli_csv(pulses)
     columns |= recorded_span(samples, rate_hz, columns["stimulus_time_s"])
     columns |= {"channel_label": labels, "channel_xy_um": xy_um, "sampling_rate_hz": rate_hz}
     plain = PlainColumns(np.empty(0), np.empty(0, np.int64), **columns)
-    base = plain.to_recording({"source": path.name, "format": f"{reader}, by SpikeInterface"})
+    with in_stimulus_file(pulses):
+        base = plain.to_recording({"source": path.name, "format": f"{reader}, by SpikeInterface"}, tuple(findings))
     get_traces = partial(recording.get_traces, segment_index=0, return_in_uV=recording.has_scaleable_traces())
 
     def read_uv(start: int, stop: int) -> Float32[np.ndarray, "samples channels"]:

@@ -18,6 +18,10 @@ from animat.tables import UNKNOWN
 
 def series_mismatch(series: Sequence[Responses]) -> str | None:
     """How recordings, in the order of time, differ in what a timeline must share, or which share a minute, if any."""
+    # First, as the other messages tell recordings apart by their minutes.
+    for one, other in pairwise(series):
+        if one.start_min == other.start_min:
+            return f"start_min: expected recordings at different minutes, got two at {in_min(one.start_min)}"
     first = series[0]
     for other in series[1:]:
         for name in ("conditions", "window_ms", "presentation", "readouts"):
@@ -26,11 +30,12 @@ def series_mismatch(series: Sequence[Responses]) -> str | None:
                     f"{name}: expected the same in all recordings, got {_words(getattr(first, name))} at "
                     f"{in_min(first.start_min)} and {_words(getattr(other, name))} at {in_min(other.start_min)}"
                 )
+        if "pattern" in (first.by or "") and other.pattern_names != first.pattern_names:
+            # Each file numbers its names by itself.
+            names = (f"{each.pattern_names or 'none'} at {in_min(each.start_min)}" for each in (first, other))
+            return f"patterns: expected the same names in all recordings, got {' and '.join(names)}"
         if others := stimulus_mismatch(first.conditions, other.conditions):
             return f"conditions: {others} at {in_min(other.start_min)}"
-    for one, other in pairwise(series):
-        if one.start_min == other.start_min:
-            return f"start_min: expected recordings at different minutes, got two at {in_min(one.start_min)}"
     return None
 
 

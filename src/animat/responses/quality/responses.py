@@ -58,6 +58,8 @@ def findings_on(
             "blank, nor how the culture fires without stimuli"
         )
         found = [Finding("spike-times-unknown", "warning", message)]
+        if source.has_times:
+            found += _overlapping(source.stimuli, responses.window_ms[1])
     elif not len(source.stimuli):
         message = (
             "the recording holds no stimuli, so there is no response to learn from: supply the stimulus times with "
