@@ -15,6 +15,7 @@ from pathlib import Path
 
 import pytest
 
+from animat.cultures.kinds import culture_arguments
 from animat.cultures.same_culture import other_culture
 from animat.cultures.series import LONGEST_MIN, STATE_FILE, _read_expected, check_interval, minutes_of, record_series
 from animat.cultures.under_way import UNDER_WAY, PartialRecording
@@ -360,3 +361,14 @@ def test_the_file_for_those_who_watch_leaves_its_room_to_the_recording(
     monkeypatch.setattr("animat.cultures.series.write_nwb", written)
     record(tmp_path, sessions=1)
     assert before == [[]] and during and all(during)
+
+
+def test_one_folder_in_two_spellings_has_one_state(
+    undisturbed: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copytree(undisturbed[0].parent, tmp_path / "rec")
+    monkeypatch.chdir(tmp_path)
+    files = [Path("rec") / undisturbed[0].name, tmp_path / "rec" / undisturbed[1].name]
+    recordings = read_recordings(files)
+    state = culture_arguments("virtual", recordings, files)["state"]
+    assert state.samefile(tmp_path / "rec" / STATE_FILE)

@@ -493,6 +493,7 @@ def test_units_are_those_of_the_robot() -> None:
         ("avoid pole_angle above 1", "expected rad or deg, got no unit"),
         ("avoid pole_angle above 1 m", "expected rad or deg, got m"),
         ("avoid cart_velocity above 1 deg/s", "expected m/s or cm/s or mm/s, got deg/s"),
+        ("avoid cart_velocity above 1 cm", "expected m/s or cm/s or mm/s, got cm"),
         ("avoid pole_angle in 2..1 rad", "the lower end first"),
         (
             "avoid pole_angle in 1 2 rad",

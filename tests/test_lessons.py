@@ -509,3 +509,14 @@ def test_a_robot_with_a_goal_is_varied_as_its_body_is() -> None:
         np.testing.assert_array_equal(of_plain, of_body)
     with pytest.raises(InvalidArgument, match="expected parameters of cartpole, got 'goal'"):
         check_lessons([Lesson(parameters={"goal": (0.0, 1.0)})], with_goal(Cartpole(), goal), draws_recordings=False)
+
+
+def test_a_best_policy_that_is_lost_is_trained_again(tmp_path: Path) -> None:
+    training = replace(SHORT, assess=2)
+    trained(training, timeline_of(), tmp_path)
+    lost = tmp_path / "best" / "p0.safetensors"
+    before = lost.read_bytes()
+    lost.unlink()
+    again = trained(training, timeline_of(), tmp_path)
+    assert lost.read_bytes() == before
+    assert all(policy.best is not None for policy in again.values())

@@ -447,3 +447,17 @@ def test_the_mean_of_any_function_comes_from_the_fewest_commands() -> None:
     for each in (np.sin, np.exp, lambda u: u**5):
         mean = (many.onto(nodes, smooth=True) @ each(nodes)).item()
         assert mean == pytest.approx(float(np.mean(each(many.levels))), abs=1e-6)
+
+
+@pytest.mark.parametrize("n_conditions", [3, 8])
+@pytest.mark.parametrize("put_around", [lambda animat: animat, ShuffledDelivery])
+def test_a_simulator_of_other_conditions_has_no_optimum(n_conditions: int, put_around: Any) -> None:
+    environment = put_around(Animat(Navigation(), Thresholds(9), n_conditions))
+    with pytest.raises(InvalidArgument, match=f"n_conditions: expected 5, those of the simulator, got {n_conditions}"):
+        best_return(environment, synthetic_simulator(), resolution=0.3, episodes=0)
+
+
+@pytest.mark.parametrize("seed", [-1, 2**32])
+def test_a_seed_that_draws_like_another_is_refused(seed: int) -> None:
+    with pytest.raises(InvalidArgument, match="seed: expected a whole number from 0 to 4294967295"):
+        best_return(Animat(Cartpole(), Linear(), 5), synthetic_simulator(), seed=seed, resolution=0.2, episodes=2)

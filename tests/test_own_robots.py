@@ -183,6 +183,8 @@ def test_in_memory_they_are_trained_and_act(tmp_path: Path) -> None:
         ({"potential": lambda self, state: jnp.stack([state.x_m])}, r"potential: expected a number, .*shape \(1,\)"),
         ({"potential": lambda self, state: state.x_m / 0}, "NaN or infinite ones in a potential"),
         ({"potential": raising}, "potential: expected it to run under jax.jit, got ZeroDivisionError"),
+        ({"with_goal_of": lambda self, state, other: state.x_m}, "with_goal_of: expected the state's structure"),
+        ({"with_goal_of": raising}, "with_goal_of: expected it to run under jax.jit, got ZeroDivisionError"),
         ({"value_grid": lambda self: 3}, "Changed.value_grid: expected a Grid, got 3"),
         ({"value_grid": raising}, "Changed.value_grid: expected a Grid, got ZeroDivisionError"),
         ({"observation_spec": property(raising)}, "observation_spec: expected a tuple of Quantity, got ZeroDivision"),

@@ -8,6 +8,7 @@ import pickle
 import re
 import subprocess
 import sys
+import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint
@@ -17,6 +18,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium.utils.env_checker import check_env
 
 from animat.cli import main
 from animat.errors import InvalidArgument, InvalidFile
@@ -397,6 +399,11 @@ def test_it_is_a_gymnasium_environment_and_is_drawn_where_it_can_be(package: Pat
     observation, _ = env.reset(seed=1)
     after, *_ = env.step(4)
     assert abs(after[0] - observation[0]) == pytest.approx(0.2, abs=1e-6)
+    assert env.unwrapped.metadata["render_modes"] == []
+    with warnings.catch_warnings():
+        # It has no bounds.
+        warnings.filterwarnings("ignore", message=".*Box observation space")
+        check_env(env.unwrapped)
     with pytest.raises(InvalidArgument, match="rover has no method `draw`"):
         gymnasium.make("animat:Animat/Robot-v0", robot=ROVER, render_mode="rgb_array")
     for make in (gymnasium.make, gymnasium.make_vec):

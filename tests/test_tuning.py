@@ -402,3 +402,31 @@ def test_the_command_counts_a_single_trial_as_one(
     monkeypatch.setattr("animat.tuning.run.tune", lambda *_, **__: tuned)
     assert main(["tune", str(TINY), "--out", str(tmp_path / "out")]) == 0
     assert "\n1 trial (1 complete) in " in capsys.readouterr().out
+
+
+def test_there_is_no_importance_where_trials_cannot_tell() -> None:
+    from animat.tuning.search import importance_of
+
+    rng = np.random.default_rng(2)
+    space = {"tau": Range(0.0, 1.0), "discount": Range(0.01, 0.99), "mapping": ("linear", "1-threshold")}
+
+    def trials(returns: list[float]) -> list[Trial]:
+        drawn = [{"tau": rng.random(), "discount": 0.5, "mapping": ("linear", "1-threshold")[i % 2]} for i in range(40)]
+        return [
+            Trial(i, settings, "complete", (60,), ((of,),))  # type: ignore[arg-type]
+            for i, (settings, of) in enumerate(zip(drawn, returns, strict=False))
+        ]
+
+    # The best tenth of ten trials is one.
+    assert importance_of(space, trials(rng.random(10).tolist())) == {}
+    # Nearly all are equally bad, and so among the best tenth.
+    assert importance_of(space, trials([0.0] * 37 + [1.0, 2.0, 3.0])) == {}
+    assert importance_of(space, trials(rng.random(40).tolist())) != {}
+
+
+@pytest.mark.parametrize("cultures", ['seeds = "1-2"', 'kind = "files"\nfolders = ["a", "b"]'])
+def test_many_cultures_are_refused_by_name(cultures: str, tmp_path: Path) -> None:
+    text = f'[culture]\n{cultures}\n[tune]\n[[robots]]\nname = "cartpole"\n[[arms]]\nname = "a"\n'
+    (tmp_path / "many.toml").write_text(text)
+    with pytest.raises(InvalidFile, match=r"many\.toml: culture\.(seeds|folders): expected one culture to tune for"):
+        read_tuning(tmp_path / "many.toml")

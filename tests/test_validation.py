@@ -701,3 +701,8 @@ def test_a_recording_without_stimuli(tmp_path: Path, capsys: pytest.CaptureFixtu
     (error,) = capsys.readouterr().err.strip().splitlines()
     assert "quiet.npz" in error
     assert "provide the stimulus times too" in error
+
+
+def test_a_seed_below_0_is_refused() -> None:
+    with pytest.raises(InvalidArgument, match=r"^seed: expected"):
+        validate(autoregressive(0.0, 200), seed=-1)

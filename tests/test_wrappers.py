@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import itertools
+import subprocess
+import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, final
@@ -270,3 +272,29 @@ def test_an_animat_has_as_many_conditions_as_its_simulator(n_conditions: int) ->
     for none in (0, -n_conditions):
         with pytest.raises(InvalidArgument, match=f"n_conditions: expected at least 1, got {none}"):
             Animat(Cartpole(), Thresholds(9), none)
+
+
+@pytest.mark.parametrize("commands", [(), (2.0, -1.0), (float("nan"),)])
+def test_commands_beyond_the_bounds_are_refused(commands: tuple[float, ...]) -> None:
+    with pytest.raises(InvalidArgument, match=r"^commands: expected numbers from -1 to 1, at least one"):
+        WithoutNeurons(Cartpole(), commands)
+
+
+def test_what_an_environment_is_made_of_is_checked() -> None:
+    # Elsewhere, as the tests check types before it can.
+    program = """
+import animat
+for make in (
+    lambda: animat.WithoutNeurons("cartpole", None),
+    lambda: animat.WithoutNeurons(animat.Cartpole(), 1.0),
+    lambda: animat.EpisodeLimit(animat.Cartpole()),
+):
+    try:
+        make()
+    except animat.InvalidArgument as error:
+        print(error)
+"""
+    ran = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    robot, commands, inside = ran.stdout.splitlines()
+    assert robot.startswith("robot: expected") and commands.startswith("commands: expected")
+    assert inside.startswith("inside: expected")

@@ -178,12 +178,17 @@ class Animat(Environment[RobotState]):
         # neurons get the same random numbers.
         return self.robot.noise_size + 2
 
-    def respond(self, uniforms: Uniforms, state: State, action: Array, simulator: Neurons) -> Responded:
+    def expect_simulator(self, simulator: Neurons) -> NeuronSimulator:
+        """The simulator; raises InvalidArgument for none, or one of another number of conditions."""
         if simulator is None:
             raise InvalidArgument("simulator: expected a neuron simulator, which an Animat needs, got None")
         if simulator.n_conditions != self.n_conditions:
             expected = f"expected {simulator.n_conditions}, those of the simulator, got {self.n_conditions}"
             raise InvalidArgument(f"n_conditions: {expected}: make the Animat with n_conditions of the simulator")
+        return simulator
+
+    def respond(self, uniforms: Uniforms, state: State, action: Array, simulator: Neurons) -> Responded:
+        simulator = self.expect_simulator(simulator)
         expect_readout_per_command(self.robot.name, self.robot.n_commands, simulator.n_readouts)
         answer = simulator.answer(action, uniforms[self.robot.noise_size], state.neurons)
         command = decode(self.mapping, answer.rate_hz, simulator.percentiles)
@@ -199,14 +204,22 @@ class WithoutNeurons(Environment[RobotState]):
             many as the robot takes.
 
     Raises:
-        InvalidArgument: for commands to pick from with a robot that takes several at once.
+        InvalidArgument: for anything but a robot, commands that are not from -1 to 1, or commands to pick from with a
+            robot that takes several at once.
     """
 
     robot: Robot[RobotState]
     commands: tuple[float, ...] | None
 
     def __post_init__(self) -> None:
+        check_argument("robot", self.robot, Robot)
         if self.commands is not None:
+            check_argument("commands", self.commands, tuple)
+            # A list would not be hashed, as static arguments under jit are.
+            object.__setattr__(self, "commands", tuple(self.commands))
+            numbers = [u for u in self.commands if isinstance(u, float | int | np.number) and -1 <= u <= 1]
+            if not self.commands or len(numbers) < len(self.commands):
+                raise InvalidArgument(f"commands: expected numbers from -1 to 1, at least one, got {self.commands}")
             expect_one_command(self.robot.name, self.robot.n_commands)
 
     @property

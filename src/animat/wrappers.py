@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from animat.arguments import check_argument
 from animat.environment import Animat, Environment, Neurons, Responded, RobotState, State, Uniforms
 from animat.errors import InvalidArgument
 from animat.robots.base import Quantity, Robot, capability
@@ -25,6 +26,9 @@ class Wrapper(Environment[RobotState]):
     """An environment that passes everything on to another, `inside`; each subclass changes something."""
 
     inside: Environment[RobotState]
+
+    def __post_init__(self) -> None:
+        check_argument("inside", self.inside, Environment)
 
     @property
     def robot(self) -> Robot[RobotState]:  # type: ignore[override]  # read-only, as in every frozen dataclass
@@ -82,6 +86,7 @@ class NeuralWrapper(Wrapper[RobotState]):
     """A wrapper of an environment with neurons; raises InvalidArgument around any other."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if not isinstance(inmost := unwrapped(self), Animat):
             raise InvalidArgument(f"inside: expected an Animat, which has neurons, got {type(inmost).__name__}")
 
@@ -218,6 +223,7 @@ class GoalSwitch(Wrapper[RobotState]):
     at: int
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         capability(self.robot, "with_goal_of")
 
     def reset(self, key: PRNGKeyArray) -> State:

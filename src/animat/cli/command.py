@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from animat.neurons.timeline import SimulatorTimeline
     from animat.responses.readouts import Readouts
     from animat.robots.base import Robot
-    from animat.studies.specification import RobotSpec
     from animat.training.policy import Policy
     from animat.training.settings import SAC
 
@@ -64,10 +63,10 @@ class JobOptions(FolderCommand):
     out: Path = Path("study")
     """Folder for all results; the report is its report.html"""
 
-    def print_caveats(self, robots: Iterable[RobotSpec]) -> None:
+    def print_caveats(self, robots: Iterable[Robot[Any]]) -> None:
         """Print the robots' caveats, and a warning for more workers than cores."""
-        for spec in robots:
-            for caveat in spec.robot().caveats():
+        for robot in robots:
+            for caveat in robot.caveats():
                 print(f"warning: {caveat}", file=sys.stderr)
         cores = len(own_cores())
         if self.workers is not None and self.workers > cores:

@@ -35,7 +35,7 @@ def run_and_report(study: Study, base: Path, command: JobOptions) -> dict[str, A
     """Run a study, whose file names are relative to `base`, and print its comparisons."""
     from animat.studies.cultures import studies_of
 
-    command.print_caveats(study.robots)
+    command.print_caveats(spec.robot() for spec in study.robots)
     return (_run_many if studies_of(study) else _run_one)(study, base, command)
 
 
@@ -71,6 +71,7 @@ def _run_one(study: Study, base: Path, command: JobOptions) -> dict[str, Any]:
         "done_now_cpu_s": ran.done_now,
         "comparisons": [asdict(row) for row in results.comparisons],
         "not_outperforming_the_heuristic": messages,
+        "findings": [each.to_dict() for each in results.findings],
     }
 
 
@@ -112,4 +113,5 @@ def _run_many(study: Study, base: Path, command: JobOptions) -> dict[str, Any]:
         "cultures": list(results.finished),
         "over_cultures": [asdict(row) for row in results.summary],
         "not_outperforming_the_heuristic": list(results.not_outperforming),
+        "findings": {name: [each.to_dict() for each in of] for name, of in results.warnings.items()},
     }

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
@@ -102,8 +101,7 @@ class Train(SimulatorOptions, JobOptions):
         board = nullcontext() if self.tensorboard is None else TensorBoard(self.tensorboard)
         expect_trainable(training, is_saved=True)
         expect_folder_for(training, self.out)
-        for caveat in training.robot.caveats():
-            print(f"warning: {caveat}", file=sys.stderr)
+        self.print_caveats([training.robot])
         timeline = None if training.mapping is None else self._timeline(readouts)
         training.environment_on(timeline)
         unused = () if timeline is None else training.unused_recordings(timeline)
@@ -265,7 +263,9 @@ def _assessed(policy: Policy, best: Policy) -> dict[str, Any]:
     table = policy.assessments
     began = {int(row[2]): int(before) for row, before in zip(table[::-1], [*table[-2::-1, 0], 0], strict=True)}
     lessons = [{"lesson": lesson, "after_iterations": began[lesson]} for lesson in sorted(began)]
-    return {"lessons": lessons, "best": as_json(dict(zip(ASSESSED, best.assessments[-1].tolist(), strict=True)))}
+    columns = dict(zip(ASSESSED, best.assessments[-1].tolist(), strict=True))
+    whole = {name: int(columns[name]) for name in ("iterations", "lesson")}
+    return {"lessons": lessons, "best": as_json(columns | whole)}
 
 
 def _in_words(assessed: dict[str, Any]) -> str:

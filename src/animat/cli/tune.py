@@ -32,7 +32,7 @@ class TuneFile(JobOptions):
         from animat.tuning.run import tune
         from animat.tuning.specification import first_settings
 
-        self.print_caveats(tuning.study.robots)
+        self.print_caveats(spec.robot() for spec in tuning.study.robots)
         began = time.monotonic()
         with self.executing("tuning") as execution:
             tuned = tune(tuning, self.out, base=self.specification.parent, **execution)

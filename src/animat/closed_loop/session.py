@@ -293,7 +293,8 @@ def _expect_no_loss(session: Session) -> None:
     with open_file(session.ticks_file) as table:
         written = sum(1 for _ in table) - 1
     if written > session.outline.ticks:
-        remedy = f"move {RECORDING_FILE} and {TICKS_FILE} away to recover what the log has"
+        files = " and ".join(file.name for file in (session.recording_file, session.ticks_file) if file.exists())
+        remedy = f"move {files} away to recover what the log has"
         expected = f"no more ticks than the log has, which is damaged after {session.outline.ticks}"
         raise Mismatch(f"{session.ticks_file}: expected {expected}, got {written}; {remedy}")
 

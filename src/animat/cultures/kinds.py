@@ -90,8 +90,10 @@ def culture_arguments(kind: CultureKind, recordings: Sequence[Recording], files:
     if kind == "virtual":
         from animat.cultures.series import STATE_FILE
 
-        folders = {file if file.is_dir() else file.parent for file in files}
-        states = [folder / STATE_FILE for folder in folders if (folder / STATE_FILE).is_file()]
+        folders = [file if file.is_dir() else file.parent for file in files]
+        # Each folder once, however it is spelled.
+        distinct = {folder.resolve(): folder for folder in folders}.values()
+        states = [folder / STATE_FILE for folder in distinct if (folder / STATE_FILE).is_file()]
         if len(states) == 1:
             arguments["state"] = states[0]
     return arguments

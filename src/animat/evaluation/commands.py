@@ -87,6 +87,7 @@ def commands_of(environment: Environment[Any], simulator: Neurons) -> Commands:
         return Commands(np.asarray(actions), np.asarray(leads_to, np.float64)[:, None], np.ones((len(actions), 1)))
     if simulator is None:
         raise InvalidArgument("simulator: expected a simulator, as an Animat acts through neurons, got None")
+    animat.expect_simulator(simulator)
     if isinstance(animat.mapping, Thresholds):
         below = np.asarray(_shares_below(animat.mapping, simulator), np.float64)
         probabilities = np.diff(np.pad(below, ((0, 0), (1, 1)), constant_values=((0, 0), (0, 1))), axis=1)
@@ -109,6 +110,7 @@ def mean_commands(
     """The environment's input for each action, and the mean command that it leads to; errors as in `commands_of`."""
     animat = unwrapped(environment)
     if isinstance(animat, Animat) and simulator is not None and animat.robot.n_commands > 1:
+        animat.expect_simulator(simulator)
         commands = decode(animat.mapping, simulator.evenly_drawn(_QUANTILES), jnp.asarray(simulator.percentiles))
         return np.arange(animat.n_conditions), np.asarray(commands.mean(axis=1), np.float64)
     of_one = commands_of(environment, simulator)
@@ -145,6 +147,7 @@ def commands_after(environment: Environment[Any], simulator: Neurons) -> list[li
     if memory is None:
         return [[commands_of(environment, simulator)]]
     assert isinstance(animat, Animat)
+    animat.expect_simulator(memory)
     levels, histories = _command_quantiles(animat, memory, _histories_of_classes(memory))
     levels, classes = np.asarray(levels, np.float64), class_of(memory, histories)
     if is_shuffled(environment):

@@ -11,7 +11,7 @@ import numpy as np
 from animat.arguments import checked_arguments
 from animat.coding.mapping import Mapping, Thresholds
 from animat.environment import Animat
-from animat.errors import UnusableData
+from animat.errors import UnusableData, expect_at_least
 from animat.evaluation.coupling import ContextGap, best_coupling, context_gap
 from animat.evaluation.optimum import Optimum, best_returns, optimal_values
 from animat.evaluation.rollouts import Uniform, roll_out
@@ -192,8 +192,9 @@ def optimal_returns(
         seed: decides every random draw.
         progress: optima, their intervals, and couplings take about as long each.
 
-    Raises UnusableData if no condition has 30 non-burst responses.
+    Raises UnusableData if no condition has 30 non-burst responses, and InvalidArgument for fewer than 0 resamples.
     """
+    expect_at_least("resamples", resamples, 0)
     enough, left_out = with_enough_samples(responses)
 
     def fit(these: Responses) -> HistogramSimulator:

@@ -18,6 +18,7 @@ from animat.environment import Animat, Environment, Neurons, WithoutNeurons
 from animat.errors import InvalidArgument, Mismatch
 from animat.evaluation.commands import CLASSES, class_of, commands_after, memory_simulator, nodes_for
 from animat.evaluation.landings import Motion, Outcomes, side_by_side
+from animat.evaluation.rollouts import check_seed
 from animat.evaluation.statistics import Interval, standard_error
 from animat.evaluation.sweeping import bellman_backup, cubic, fill_row_weights, look_ahead
 from animat.neurons.history import INITIAL_HISTORY
@@ -167,6 +168,7 @@ def best_returns(
         raise InvalidArgument(f"episodes: expected at least 2, or 0 not to run the controller, got {episodes}")
     if not (math.isfinite(resolution) and resolution > 0):
         raise InvalidArgument(f"resolution: expected a positive number, got {resolution!r}")
+    check_seed(seed)
     robot = cases[0][0].robot
     for environment, _ in cases:
         if environment.robot != robot:

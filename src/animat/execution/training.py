@@ -33,7 +33,7 @@ from animat.training.folder import (
     groups_of,
     write_description,
 )
-from animat.training.group import CHECKPOINT_S, Group, train_groups
+from animat.training.group import BEST, CHECKPOINT_S, Group, train_groups
 from animat.training.policy import Policy
 from animat.training.specification import CHUNKS, Training
 from animat.writing import exclusive_lock
@@ -166,7 +166,8 @@ def as_range(members: Sequence[int]) -> str:
 
 
 def _is_trained(group: Group, folder: Path) -> bool:
-    files = [folder / f"p{member}.safetensors" for member in group.members]
+    folders = [folder, folder / BEST] if group.training.episodes_assessed else [folder]
+    files = [each / f"p{member}.safetensors" for each in folders for member in group.members]
     return all(file.exists() and Policy.load(file).provenance.get("fingerprint") == group.fingerprint for file in files)
 
 

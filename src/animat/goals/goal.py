@@ -200,7 +200,7 @@ def _factor(unit: str, quantity: Quantity) -> float:
     (other, _, per), (own, _, own_per) = unit.partition("/"), own_unit.partition("/")
     if per == own_per and (other, own) in _FACTORS:
         return _FACTORS[other, own]
-    also = [f"{known}/{per}" if own_per else known for known, base in _FACTORS if base == own]
+    also = [f"{known}/{own_per}" if own_per else known for known, base in _FACTORS if base == own]
     expected = " or ".join([own_unit, *also]) if own_unit else "no unit"
     raise InvalidArgument(f"{quantity.name}: expected {expected}, got {unit or 'no unit'}")
 

@@ -65,6 +65,8 @@ class CompiledAnimats:
         if render_mode is not None:
             capability(self.setup.environment.robot, "draw")
         self.render_mode = render_mode
+        if not hasattr(self.setup.environment.robot, "draw"):
+            self.metadata = {**self.metadata, "render_modes": []}
         if (step_s := getattr(without_goal(self.setup.environment.robot), "step_s", None)) is not None:
             # Films are then in real time.
             self.metadata = {**self.metadata, "render_fps": max(1, round(1 / step_s))}

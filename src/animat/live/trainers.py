@@ -26,7 +26,7 @@ from animat.training.group import Group, SideBySide, save_policies
 from animat.writing import write_whole
 
 KEEP_S = 10.0
-"""Seconds between saves of the unfinished policies: the most training that a killed run loses."""
+"""Seconds after which the unfinished policies are saved, at the end of a chunk."""
 _PATIENCE_S = 120.0
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from animat.arguments import checked_arguments
-from animat.errors import InvalidArgument
+from animat.errors import InvalidArgument, expect_at_least
 from animat.neurons.history import NO_MEMORY
 from animat.neurons.memory import MemorySimulator
 from animat.neurons.prediction import CLASSES, Halves, free_runs, halved, in_time, predict, recorded_series, share_below
@@ -212,11 +212,12 @@ def validate(responses: Responses, *, kind: str | None = None, seed: int = 1, re
 
     Raises:
         UnusableData: as `halved` does.
-        InvalidArgument: for a kind or a readout that does not exist.
+        InvalidArgument: for a kind or a readout that does not exist, or a seed below 0.
     """
     n = len(responses.readouts)
     if (readout is None) != (n == 1) or not 0 <= (readout or 0) < n:
         raise InvalidArgument(f"readout: expected one of {n} readouts, or None if there is only one, got {readout}")
+    expect_at_least("seed", seed, 0)
     rng, halves = np.random.default_rng(seed), halved(responses, readout)
     median_hz = halves.percentiles_hz[5]
     kinds: tuple[str, ...] = get_args(SimulatorKind)

@@ -83,6 +83,9 @@ def _checked_episode(robot: Robot[Any], key: Any) -> tuple[list[tuple[Any, ...]]
     first = state = _call(f"{name}.reset", robot.reset, key)
     if any(jnp.issubdtype(jnp.result_type(leaf), jax.dtypes.prng_key) for leaf in jax.tree.leaves(state)):
         raise InvalidArgument(f"{name}.reset: expected a state of numbers, got a key: store jax.random.key_data")
+    if hasattr(robot, "with_goal_of"):
+        switched = _call(f"{name}.with_goal_of", robot.with_goal_of, first, first)
+        _expect_same_structure(f"{name}.with_goal_of", switched, first)
     outputs, commands = [_outputs(robot, state, 0.0)], []
     # Commands at both ends and in the middle.
     for number, u in enumerate(np.linspace(-1.0, 1.0, _STEPS, dtype=np.float32), 1):

@@ -30,7 +30,7 @@ def compare_with_heuristic(study: Study, table: DataFrame, spec: RobotSpec) -> I
                 outcome = (OUTPERFORM if found.is_outperformed else NOT) if found.has_enough_episodes else TOO_FEW
                 # The mean of the policies' means, as in the scores: another order of summation can round differently.
                 means = float(mean_returns(episodes).mean()), float(heuristic_returns[at_min].mean())
-                yield HeuristicComparison(spec.name, arm.name, at_min, *means, found.p, found.wins, outcome)
+                yield HeuristicComparison(spec.name, arm.name, at_min, *means, found.p_best, found.wins, outcome)
 
 
 def not_outperforming(results: Results) -> list[str]:

@@ -157,4 +157,7 @@ def _lists_in(entry: dict[str, Any]) -> Iterator[tuple[tuple[str, ...], list[Any
 
 
 def _name_part(value: Any) -> str:
+    if isinstance(value, str):
+        # Classes of one's own, such as my_package.robots:Rover: names have no colons.
+        return value.replace(":", ".")
     return str(value).lower() if isinstance(value, bool) else f"{value:g}" if isinstance(value, float) else str(value)

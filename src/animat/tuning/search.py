@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -23,8 +24,8 @@ if TYPE_CHECKING:
 
 JOURNAL = "journal.jsonl"
 """One line per trial, with its settings and returns, in the order of their numbers."""
-FEWEST = 4
-"""Fewest trials from which importance is reported."""
+FEWEST = 20
+"""Fewest trials from which importance is reported: it compares the best tenth with all, which one trial cannot show."""
 
 
 @dataclass(frozen=True)
@@ -115,7 +116,7 @@ class Search:
 
 
 def importance_of(space: Space, results: Sequence[Trial]) -> dict[str, float]:
-    """The share of each setting in the return after the first rung, the largest first; empty for too few trials.
+    """The share of each setting in the return after the first rung, the largest first; empty if trials cannot tell.
 
     By PED-ANOVA (Watanabe et al. 2023, arXiv:2304.10255); every trial that did not diverge has the first rung's return.
     """
@@ -129,7 +130,13 @@ def importance_of(space: Space, results: Sequence[Trial]) -> dict[str, float]:
         params = _mirrored(space, result.settings)
         study.add_trial(optuna.trial.create_trial(params=params, distributions=among, value=result.means[0]))
     evaluator = optuna.importance.PedAnovaImportanceEvaluator()
-    shares = optuna.importance.get_param_importances(study, evaluator=evaluator, params=list(space))
+    with warnings.catch_warnings():
+        # Most returns are equal: all trials are among the best tenth, and Optuna would give equal shares.
+        warnings.filterwarnings("error", message="Target and region quantiles")
+        try:
+            shares = optuna.importance.get_param_importances(study, evaluator=evaluator, params=list(space))
+        except UserWarning:
+            return {}
     return {name: float(share) for name, share in sorted(shares.items(), key=lambda pair: (-pair[1], pair[0]))}
 
 

@@ -236,6 +236,9 @@ def tuning_of(study: Study, tune: Tune) -> Tuning:
     for name in ("robots", "arms"):
         if (n := len(getattr(study, name))) != 1:
             raise InvalidArgument(f"{name}: expected one [[{name}]] to tune for, got {n}")
+    for name in ("seeds", "folders"):
+        if got := getattr(study.culture, name):
+            raise InvalidArgument(f"culture.{name}: expected one culture to tune for, got {got!r}")
     if not study.arms[0].trained:
         raise InvalidArgument("arms.trained: expected an arm that is trained, got one that is not")
     if isinstance(robot := study.robots[0].robot(), HostRobot):

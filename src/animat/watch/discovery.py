@@ -101,6 +101,8 @@ def is_locked(folder: Path) -> bool | None:
         lines = [line.split() for line in _LOCKS.read_text().splitlines()]
     except OSError:
         return None
+    # By inode alone: on btrfs and some overlays a file's device is not the one listed. If a folder on another disk has
+    # the same inode, work that ended may look alive, but never the other way round.
     # A process that waits for a lock has an arrow before it, and does not hold it.
     return any(words[1:2] == ["FLOCK"] and words[5].rpartition(":")[2] in numbers for words in lines if len(words) > 5)
 
