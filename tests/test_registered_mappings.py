@@ -196,3 +196,10 @@ def test_what_is_not_registered_is_not_named_by_a_file(package: Path) -> None:
     with pytest.raises(InvalidArgument, match=r"expected a registered one.* got Steep, .*register_mapping"):
         train(Training("cartpole", kind(), algorithm=SMALL), timeline_of(), package / "out")
     assert not (package / "out").exists()
+
+
+def test_it_may_be_one_of_a_list_in_a_specification(package: Path) -> None:
+    listed = f'[[arms]]\nname = "{{mapping}}"\nmapping = ["1-threshold", "{STEEP}"]\n'
+    (package / "study.toml").write_text(listed)
+    study = read_study(package / "study.toml")
+    assert [arm.name for arm in study.arms] == ["1-threshold", "my_package.mappings.Steep"]

@@ -874,6 +874,7 @@ COMPARED = (
             "culture.pulses: expected only for a culture that",
         ),
         ("[[robots]]\nname = 'cartpole'\nparameters = { name = 1 }", "expected parameters among"),
+        ('[[arms]]\nname = "a"\nshadowng = [true, false]', "shadowng: no such setting in [arms]"),
         ('[[arms]]\nname = "a"\nshadowing = "off"', "arms.shadowing: expected True, False or 'drawn', got 'off'"),
         ("[culture]\nfrequencies_hz = [20]", "expected two or more for an agent to choose from, got one (20 Hz)"),
         (

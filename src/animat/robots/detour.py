@@ -44,6 +44,7 @@ class Detour(Wheels):
     obstacles: Obstacles = _POSTS
 
     name: ClassVar[str] = "detour"
+    paper_iterations: ClassVar[int] = 2_000_000
 
     def __post_init__(self) -> None:
         if len(super()._goals_m) and not len(self._goals_m):

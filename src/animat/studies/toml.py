@@ -15,12 +15,16 @@ from animat.arguments import checked_arguments
 from animat.errors import InvalidArgument, InvalidFile, in_file
 from animat.records import read_record
 from animat.studies.source import MOST_ENTRIES
-from animat.studies.specification import Study
+from animat.studies.specification import Arm, Compared, RobotSpec, Study
 from animat.training.settings import FORMER as FORMER_SETTINGS
 
 MOST_BYTES = 2**20
 """Of a specification."""
 TABLES = ("robots", "arms", "comparisons")
+_KEYS = {
+    table: {field.name for field in dataclasses.fields(kind)}
+    for table, kind in zip(TABLES, (RobotSpec, Arm, Compared), strict=True)
+}
 FORMER = {
     "": {"conditions": "arms", "limit_resolution": "optimum_resolution", "limit_episodes": "optimum_episodes"},
     "robots": {"limit_resolution": "optimum_resolution"},
@@ -129,6 +133,8 @@ def expand_lists(data: Mapping[str, Any]) -> dict[str, Any]:
 
 def _combinations(table: str, entry: Any) -> Iterator[Any]:
     lists = dict(_lists_in(entry)) if isinstance(entry, dict) else {}
+    # Keys that do not exist are reported where the entry is read.
+    lists = {path: values for path, values in lists.items() if path[0] in _KEYS[table]}
     if not lists:
         yield entry
         return
