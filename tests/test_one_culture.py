@@ -256,18 +256,23 @@ def test_recordings_that_overlap_in_time_cause_a_warning(start_min: float, over_
 
 def test_names_of_patterns_that_files_number_differently_are_no_series(tmp_path: Path) -> None:
     rng = np.random.default_rng(5)
-    for day, names in enumerate((["left", "right"], ["right", "up"], ["right", "left"])):
+    of_days: list[list[Any]] = [["left", "right"], ["right", "up"], ["right", "left"], ["left", "right", "up"], [0, 1]]
+    for day, names in enumerate(of_days):
         time_s, pattern = 0.5 + 0.25 * np.arange(80), rng.choice(names, 80)
         spikes_s = np.sort(np.concatenate([time_s + 0.005, rng.uniform(0, 20, 200)]))
         columns = {"spike_time_s": spikes_s, "spike_channel": rng.integers(0, 4, 280), "channel_label": np.arange(4)}
         stimuli = {"stimulus_time_s": time_s, "stimulus_pattern": pattern}
         np.savez(tmp_path / f"{day}.npz", **columns, **stimuli, start_min=60.0 * day, duration_s=21.0)
-    first, other, same = extract_series([read_recording(tmp_path / f"{day}.npz") for day in range(3)], "pattern")
+    recordings = [read_recording(tmp_path / f"{day}.npz") for day in range(5)]
+    first, other, same, _, numbered = extract_series(recordings, "pattern")
     assert series_mismatch([first, same]) is None
     (found,) = unlike_finding([first, other])
-    got = "got 0: left, 1: right at 0 min and 0: right, 1: up"
-    assert f"patterns: expected the same names in all recordings, {got}" in found.message
-    with pytest.raises(Mismatch, match=r"^patterns: expected the same names"):
+    expected = "patterns: expected the same names in all recordings"
+    assert f"{expected}, got 'left' at 0 min and 'right' at 60 min for pattern 0" in found.message
+    with pytest.raises(Mismatch, match=f"^{expected}"):
         fit_timeline([first, other])
-    # Not where conditions are others.
+    assert f"{expected}, got 'left' at 0 min and 'none' at 240 min" in str(series_mismatch([first, numbered]))
+    # Not where conditions are others, nor by a pattern that only one of them has.
     assert series_mismatch([replace(first, by="frequency"), replace(other, by="frequency")]) is None
+    two, _, _, three, _ = extract_series(recordings, "pattern:0,1")
+    assert series_mismatch([two, three]) is None

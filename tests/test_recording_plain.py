@@ -791,3 +791,10 @@ def test_errors_on_stimuli_name_their_file(stimuli: str, words: str, tmp_path: P
 def test_channels_that_no_float_tells_apart_are_names(labels: tuple[str, str], tmp_path: Path) -> None:
     (tmp_path / "a_spikes.csv").write_text(f"time_s,channel\n0.1,{labels[0]}\n0.2,{labels[1]}\n")
     assert sorted(read_recording(tmp_path / "a_spikes.csv").channels.label.tolist()) == sorted(labels)
+
+
+def test_a_pattern_that_is_no_number_of_patterns_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "a_spikes.csv").write_text("time_s,channel\n0.1,3\n0.2,4\n")
+    (tmp_path / "a_stimuli.csv").write_text("time_s,pattern\n0,5\n0.1,inf\n0.2,10\n")
+    with pytest.raises(InvalidFile, match=r"a_stimuli.csv: stimulus_pattern: expected whole numbers, got inf"):
+        read_recording(tmp_path / "a_spikes.csv")

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import gzip
+import warnings
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 
@@ -385,3 +387,42 @@ def test_stimuli_of_a_table_are_checked_like_those_of_spikes(
         assert not wanted & set(found)
     else:
         assert found[name] == severity
+
+
+def test_trials_with_times_stay_in_the_order_of_their_times(tmp_path: Path) -> None:
+    lines = ["trial,time_s,channel,count", "3,0.1,0,1", "1,0.2,0,2", "2,0.3,0,3"]
+    (tmp_path / "a_responses.csv").write_text("\n".join(lines) + "\n")
+    table = table_of(tmp_path / "a_responses.csv")
+    assert table.values[:, 0].tolist() == [1, 2, 3]
+    assert not {"unsorted-stimuli", "trials-missing"} & {finding.name for finding in table.findings}
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".tsv", ".CSV", ".txt"])
+def test_spikes_by_name_are_no_table(suffix: str, tmp_path: Path) -> None:
+    (tmp_path / f"b_spikes{suffix}").write_text("time_s,channel,count\n0.1,0,1\n0.2,1,1\n")
+    assert not isinstance(read_source(tmp_path / f"b_spikes{suffix}"), ResponseTable)
+
+
+def test_the_window_of_a_policy_is_none_that_was_given(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    counts = np.random.default_rng(1).poisson([[1.0] * 8, [3.0] * 8] * 150)
+    columns: dict[str, Any] = {"response_count": counts, "stimulus_frequency_hz": np.tile([5.0, 20.0], 150)}
+    np.savez(tmp_path / "unstated.npz", **columns)
+    np.savez(tmp_path / "stated.npz", response_window_ms=[5, 25], **columns)
+    policies = str(tmp_path / "policies")
+    training = ["train", "cartpole", "--iterations", "60", "--policies", "1", "--sac", "hidden=8", "--out", policies]
+    assert main([*training, "--recordings", str(tmp_path / "unstated.npz")]) == 0
+    capsys.readouterr()
+    assert main(["evaluate", policies, "--episodes", "2", "--recordings", str(tmp_path / "stated.npz")]) == 0
+    assert "other-window" in capsys.readouterr().err
+    assert main(["evaluate", policies, "--episodes", "2", "--recordings", str(tmp_path / "unstated.npz")]) == 0
+    assert "window-assumed" in capsys.readouterr().err
+
+
+def test_gymnasium_reads_a_table_in_its_own_window(tmp_path: Path) -> None:
+    counts = np.random.default_rng(1).poisson([[1.0] * 8, [3.0] * 8] * 150)
+    columns: dict[str, Any] = {"response_count": counts, "stimulus_frequency_hz": np.tile([5.0, 20.0], 150)}
+    np.savez(tmp_path / "stated.npz", response_window_ms=[5, 25], **columns)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        env = gymnasium.make("animat:Animat/Cartpole-v0", recordings=tmp_path / "stated.npz")
+    assert env.action_space.n == 2  # type: ignore[attr-defined]

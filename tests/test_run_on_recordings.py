@@ -17,10 +17,10 @@ from animat.coding.mapping import Thresholds
 from animat.cultures.devices.cl1 import CL1_PULSE
 from animat.cultures.series import STATE_FILE, record_series
 from animat.cultures.virtual import VirtualCulture
-from animat.errors import in_min
+from animat.errors import InvalidArgument, in_min
 from animat.neurons.memory import MemorySimulator
 from animat.neurons.simulator import EmpiricalSimulator, HistogramSimulator, NeuronSimulator, pooled_percentiles
-from animat.reality_gap import Calibration
+from animat.reality_gap import Calibration, check_policies
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.reading import read_recording, read_recordings
 from animat.responses.condition import Condition
@@ -400,3 +400,9 @@ def test_recordings_that_lack_a_frequency_are_refused_with_what_they_have(
         "conditions: expected 5 Hz, 30 Hz, from which the policies choose, got recordings with 5 Hz, 10 Hz, 20" in said
     )
     assert not (tmp_path / "session").exists()
+
+
+def test_no_policy_of_several_is_named_like_all_together() -> None:
+    policy = policy_of(1)
+    with pytest.raises(InvalidArgument, match=r"^policies: expected none called 'policies', .*: rename its file"):
+        check_policies({"policies": policy, "p1": policy})

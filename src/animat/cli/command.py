@@ -175,6 +175,7 @@ class SimulatorOptions(ResponseOptions):
         from animat.responses.conditions import conditions_named
         from animat.responses.extraction import extract_series
         from animat.responses.readouts import ALL
+        from animat.responses.windows import DEFAULT_WINDOW_MS
 
         fitted = {} if trained is None else trained.fitted
         fit = simulator_settings(fitted, self.simulator, self.bins, self.range_hz)
@@ -183,10 +184,12 @@ class SimulatorOptions(ResponseOptions):
         by = self.conditions or fitted.get("by")
         # Before recordings are read, which can take a while.
         conditions = None if by is None else conditions_named(by)
+        # The usual window of a policy is none that was given, so a table's own takes its place.
+        window_ms = None if trained is None or trained.window_ms == DEFAULT_WINDOW_MS else trained.window_ms
         series = extract_series(
             read_sources(recordings),
             conditions,
-            self.window_ms or (None if trained is None else trained.window_ms),
+            self.window_ms or window_ms,
             burst_threshold=fitted.get("burst_threshold") if self.burst_threshold is None else self.burst_threshold,
             allow=self.allow,
             readouts=readouts or (ALL if trained is None else trained.readouts),

@@ -113,5 +113,5 @@ def _run_many(study: Study, base: Path, command: JobOptions) -> dict[str, Any]:
         "cultures": list(results.finished),
         "over_cultures": [asdict(row) for row in results.summary],
         "not_outperforming_the_heuristic": list(results.not_outperforming),
-        "findings": {name: [each.to_dict() for each in of] for name, of in results.warnings.items()},
+        "warnings": {name: [each.to_dict() for each in of] for name, of in results.warnings.items()},
     }

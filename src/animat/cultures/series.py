@@ -189,7 +189,7 @@ def check_interval(protocol: Protocol, sessions: int, interval_min: float, n_pat
         raise InvalidArgument(f"interval_min: expected more than 0 minutes, got {interval_min:g}")
     if sessions > 1 and sessions * interval_min > LONGEST_MIN:
         given = f"{shown(sessions)} every {interval_min:g} min"
-        raise InvalidArgument(f"interval_min: expected recordings within a year, got {given}")
+        raise InvalidArgument(f"sessions: expected recordings within a year, got {given}")
     takes_min = minutes_of(protocol, n_patterns)
     if sessions > 1 and interval_min < takes_min:
         expected = f"at least the {takes_min:.2f} min that a recording takes"

@@ -94,12 +94,12 @@ class InterventionTable:
 
     def to_text(self) -> str:
         """A table for a terminal."""
-        cells = []
+        cells, has_goals = [], self.rows[0].information is not None
         for row in self.rows:
             lost = ["", ""] if row.name == AS_THEY_ARE else [f"{row.lost.value:.1f}", row.lost.ends]
             bits = "" if row.information is None else f"{row.information.bits.value:.2f}"
-            cells.append([row.name, f"{row.returns.mean():.1f}", *lost, bits, row.meaning])
-        head = ["", "return", "lost", "95 % interval", "bits", ""]
+            cells.append([row.name, f"{row.returns.mean():.1f}", *lost, *([bits] if has_goals else []), row.meaning])
+        head = ["", "return", "lost", "95 % interval", *(["bits"] if has_goals else []), ""]
         lines = ["whose work is it: the same policies with each intervention", *align_columns(head, cells)]
         information = self.rows[0].information
         one_goal = "no goal information: the robot has only one goal (no method `with_goal_of`)"

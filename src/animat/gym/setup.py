@@ -30,7 +30,7 @@ from animat.registry import is_ours
 from animat.responses.conditions import conditions_named
 from animat.responses.extraction import extract_series
 from animat.responses.readouts import DEFAULT_READOUTS, Readouts, count_readouts, readouts_named
-from animat.responses.windows import DEFAULT_WINDOW_MS, check_window
+from animat.responses.windows import check_window
 from animat.robots.base import Robot
 from animat.robots.checking import check_robot
 from animat.robots.host import HostRobot
@@ -70,7 +70,7 @@ def set_up(
     simulator: NeuronSimulator | None = None,
     at_min: float | None = None,
     conditions: str | None = None,
-    window_ms: tuple[float, float] = DEFAULT_WINDOW_MS,
+    window_ms: tuple[float, float] | None = None,
     kind: SimulatorKind | None = None,
     readouts: str | Readouts | None = None,
     delivery: Delivery = "chosen",
@@ -90,7 +90,7 @@ def set_up(
         at_min: which recording's simulator, in minutes on the culture's clock: the newest at that time; None: the
             first.
         conditions: what the agent picks from, `frequency`, `interval:5,10+-25%`, ...; None: what the recording has.
-        window_ms: start and end of the response window after a stimulus.
+        window_ms: start and end of the response window after a stimulus; None: 2 to 10 ms, or a table's own.
         kind: `histogram` (the paper), `empirical` or `memory`; None: what suits the recordings (`fit_timeline`).
         readouts: of the recordings, as many as the robot takes commands: `halves`, `quadrants`, or groups; None: all
             channels as one or, for several commands, the default of `animat train`.
@@ -115,9 +115,9 @@ def set_up(
     if recordings is not None and simulator is not None:
         raise InvalidArgument("recordings, simulator: expected one of them, got both")
     expect_kind("at_min", at_min, Real | None, "a number of minutes")
-    check_window(window_ms)
-    window = None if tuple(window_ms) == DEFAULT_WINDOW_MS else window_ms
-    reading = {"at_min": at_min, "conditions": conditions, "kind": kind, "readouts": readouts, "window_ms": window}
+    if window_ms is not None:
+        check_window(window_ms)
+    reading = {"at_min": at_min, "conditions": conditions, "kind": kind, "readouts": readouts, "window_ms": window_ms}
     for name, value in reading.items():
         if value is not None and recordings is None:
             raise InvalidArgument(f"{name}: expected only with recordings, as it sets how they are read")

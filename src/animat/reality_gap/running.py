@@ -36,7 +36,7 @@ from animat.reality_gap.outlook import Outlook, outlook
 from animat.reality_gap.predicting import EPISODES, MOST_ON_HOST, few_predicted, pool, predict_agents
 from animat.reality_gap.reasons import Evidence, reasons
 from animat.reality_gap.session_responses import read_responses
-from animat.reality_gap.session_rows import session_rows
+from animat.reality_gap.session_rows import ALL_POLICIES, session_rows
 from animat.reality_gap.simulation import Simulation
 from animat.reality_gap.table import RealityGap, intervention_table
 from animat.recordings.findings import Finding, warnings_once
@@ -330,9 +330,12 @@ def check_policies(policies: Mapping[str, Policy]) -> Policy:
 
     Those of an interrupted live training need not have met the same recordings.
 
-    Raises InvalidArgument for no policies, Mismatch if they differ in more than in their networks, and UnusableData for
-    policies without neurons.
+    Raises InvalidArgument for no policies, or if one of several is called `policies`, Mismatch if they differ in more
+    than in their networks, and UnusableData for policies without neurons.
     """
+    if len(policies) > 1 and ALL_POLICIES in policies:
+        all_of_them = "which is the name of all of them together"
+        raise InvalidArgument(f"policies: expected none called {ALL_POLICIES!r}, {all_of_them}: rename its file")
     alike = ("robot", "mapping", "readouts", "conditions", "commands", "presentation", "window_ms", "fitted")
     first = first_of_alike(policies, (*alike, "percentiles", "delivery", "pulse_cost"), "run it alone")
     if first.mapping is None:

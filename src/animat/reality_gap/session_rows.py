@@ -19,6 +19,9 @@ from animat.reality_gap.row import Row
 from animat.reality_gap.session_responses import outcomes
 from animat.robots.starts import Starts
 
+ALL_POLICIES = "policies"
+"""The name of the row of all policies together."""
+
 
 def session_rows(
     session: Session,
@@ -73,7 +76,7 @@ def session_rows(
             from_all_starts=float(from_all.returns.mean()),
         )
 
-    policies = row("policies" if len(names) > 1 else names[0], "as trained", names)
+    policies = row(ALL_POLICIES if len(names) > 1 else names[0], "as trained", names)
     rows = [policies]
     # A single policy has its row already.
     for agent in agents if len(names) > 1 else agents[1:]:

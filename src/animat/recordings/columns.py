@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any
@@ -203,6 +204,12 @@ class PlainColumns:
         if (pulses := self.presentation_pulses or 1) > 1 and n:
             raise UnusableData(f"stimulus_presentation: required to know which {pulses} pulses are one trial, got none")
         return np.arange(n)
+
+
+def pattern_names(provenance: Mapping[str, str]) -> dict[int, str]:
+    """The names that a file had for patterns, by the numbers that they got (`PlainColumns`); empty without names."""
+    listed = re.findall(r"(?:^|, )(\d+): (.*?)(?=, \d+: |$)", provenance.get("patterns", ""))
+    return {int(number): name for number, name in listed}
 
 
 def columns_of(recording: Recording) -> dict[str, Any]:

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float64, Int64
 
 from animat.arguments import checked_arguments
 from animat.errors import InvalidArgument, Mismatch, UnusableData, did_you_mean, in_min
+from animat.recordings.columns import pattern_names
 from animat.recordings.findings import Finding
 from animat.recordings.quality import recording_findings
 from animat.recordings.recording import Recording, ResponseTable
@@ -127,7 +128,7 @@ def extract_responses(
         by=str(by),
         burst_threshold=burst_threshold,
         culture=source.culture,
-        pattern_names=source.provenance.get("patterns"),
+        pattern_names=pattern_names(source.provenance),
         channels=source.channels,
         readouts=readouts,
         readout_hz=None if readouts.are_all else _read_groups(source, presented[chosen], window_ms, readouts),

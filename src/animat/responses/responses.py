@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from typing import TYPE_CHECKING, Any
 
@@ -69,7 +69,7 @@ class Responses:
         by: the rule that sorted stimuli into conditions, as `conditions_named` reads it; None if it is not known.
         burst_threshold: the given threshold; None: it is Otsu's.
         culture, recorded_at: which was recorded, and when; None if it is not known.
-        pattern_names: the file's names for numbers of patterns; None if it has none.
+        pattern_names: the names that the file has for patterns, by their numbers; empty if it has none.
         channels: those over which x is a mean; None if they are not known.
         readouts: the groups of channels read; by default all channels as one.
         readout_hz: x of each readout, shape (responses, readouts), or (responses,) for one; None: it is `rate_hz`.
@@ -101,7 +101,7 @@ class Responses:
     burst_threshold: float | None = None
     culture: RecordedCulture | None = None
     recorded_at: datetime | None = None
-    pattern_names: str | None = None
+    pattern_names: Mapping[int, str] = field(default_factory=dict)
     channels: Channels | None = None
     readouts: Readouts = ALL
     readout_hz: Float64[np.ndarray, "responses *readouts"] | None = None

@@ -360,13 +360,10 @@ def _read_arrays(path: Path) -> tuple[dict[str, np.ndarray[Any, Any]], dict[str,
 def first_of_alike(policies: Dict[str, Policy], attributes: Sequence[str], advice: str) -> Policy:
     """The first of several policies, which represents all of them.
 
-    `attributes` include their conditions. Raises Mismatch if one differs, or stimuli do; InvalidArgument for none, or
-    for one of several that is called `policies`.
+    `attributes` include their conditions. Raises Mismatch if one differs, or stimuli do; InvalidArgument for none.
     """
     if not policies:
         raise InvalidArgument("policies: expected at least one, got none")
-    if len(policies) > 1 and "policies" in policies:
-        raise InvalidArgument("policies: expected other names than policies, that of all together: rename the file")
     first_name, first = next(iter(policies.items()))
     for name, policy in policies.items():
         for attribute in (*attributes, "neural_observation"):

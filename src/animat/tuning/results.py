@@ -52,7 +52,7 @@ class Final:
 class TuningResult:
     """The outcome of a tuning; in `finals` the study's own settings, the defaults if tried, then the best trials.
 
-    `importance` is the share of each setting, the largest first; empty for fewer than four trials.
+    `importance` is the share of each setting, the largest first; empty if the trials cannot tell.
     """
 
     folder: Path

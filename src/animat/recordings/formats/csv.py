@@ -40,7 +40,7 @@ def read_csv(table: TextTable, stimuli_path: str | os.PathLike[str] | None = Non
     recording has no stimuli, with a finding.
     """
     path = table.path
-    if stimuli_path is None and _stem(path).endswith("_stimuli"):
+    if stimuli_path is None and text_stem(path.name).endswith("_stimuli"):
         raise InvalidFile(f"{path}: expected a spike file, got the stimuli that belong to one; name the spike file")
     stimuli = stimuli_beside(path) if stimuli_path is None else Path(stimuli_path)
     provenance = {"source": path.name, "format": "CSV"}
@@ -85,14 +85,15 @@ def stimuli_beside(path: Path) -> Path | None:
 
 
 def _stimuli_beside(path: Path) -> list[Path]:
-    name = _stem(path).removesuffix("_spikes")
+    name = text_stem(path.name).removesuffix("_spikes")
     # Its own suffix first, such as .tsv.
-    suffixes = dict.fromkeys([path.name[len(_stem(path)) :], ".csv", ".csv.gz"])
+    suffixes = dict.fromkeys([path.name[len(text_stem(path.name)) :], ".csv", ".csv.gz"])
     return [path.with_name(f"{name}_stimuli{suffix}") for suffix in suffixes if suffix]
 
 
-def _stem(path: Path) -> str:
-    return re.sub(r"\.(csv|tsv|txt)(\.gz)?$", "", path.name, flags=re.IGNORECASE)
+def text_stem(name: str) -> str:
+    """A file's name without its ending, if that is one of text."""
+    return re.sub(r"\.(csv|tsv|txt)(\.gz)?$", "", name, flags=re.IGNORECASE)
 
 
 def _known_columns(table: TextTable, known: Mapping[str, tuple[str, ...]]) -> dict[str, Any]:
@@ -163,7 +164,7 @@ def plain_column(table: TextTable, place: int, name: str) -> Column:
         return np.array(cells, dtype=np.str_)
     named = {cell for cell, number in zip(cells, numbers.tolist(), strict=True) if number == number}
     are_alike = len({*as_numbers([*named]).tolist()}) < len({re.sub(r"\.0*$", "", name.strip()) for name in named})
-    if are_alike or np.any(np.abs(numbers) >= 2**53):
+    if are_alike or (name == "spike_channel" and np.any(np.abs(numbers) >= 2**53)):
         # Names that look like numbers, such as 01 beside 1, inf, or serial numbers that floats do not represent.
         return np.array(cells, dtype=np.str_)
     if np.any(wrong := numbers > np.floor(numbers)):

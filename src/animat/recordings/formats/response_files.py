@@ -13,7 +13,7 @@ from jaxtyping import Float64, Int64
 from animat.errors import InvalidFile, UnusableData, some_of
 from animat.recordings.columns import Column, PlainColumns
 from animat.recordings.findings import Finding, left_out_findings
-from animat.recordings.formats.csv import SPIKE_COLUMNS, STIMULUS_COLUMNS, nearest, plain_column
+from animat.recordings.formats.csv import SPIKE_COLUMNS, STIMULUS_COLUMNS, nearest, plain_column, text_stem
 from animat.recordings.formats.npz import KEYS, load_columns
 from animat.recordings.formats.text_table import TextTable, as_numbers, folded
 from animat.recordings.recording import ResponseKind, ResponseTable
@@ -28,11 +28,11 @@ TRIAL = "trial"
 
 def _is_response_table(table: TextTable) -> bool:
     """Whether text is a response table, by its header and the file's name."""
-    names, file_name = {folded(head) for head in table.header}, table.path.name.lower()
+    names, stem = {folded(head) for head in table.header}, text_stem(table.path.name).lower()
     # Spike files may have columns of counts and rates too.
-    if names & SPIKE_COLUMNS.keys() or file_name.endswith(("_spikes.csv", "_spikes.csv.gz")):
+    if names & SPIKE_COLUMNS.keys() or stem.endswith("_spikes"):
         return False
-    if file_name.endswith(("_responses.csv", "_responses.csv.gz")) and not names & {"time", "time_s"}:
+    if stem.endswith("_responses") and not names & {"time", "time_s"}:
         # By its name it is a response table, even if columns are missing.
         return True
     is_long = "channel" in names and bool(names & set(KINDS))
@@ -114,7 +114,7 @@ def _label(head: str, kind: ResponseKind) -> str:
 
 
 def _by_trial(table: TextTable) -> TextTable:
-    """A long table in the order of its trials if they are numbered, and a finding on numbers without a line."""
+    """A long table without times in the order of its trials if they are numbered; notes numbers without a line."""
     place = table.place((TRIAL,))
     try:
         numbers = np.empty(0) if place is None else as_numbers(table.text(place))
@@ -128,6 +128,8 @@ def _by_trial(table: TextTable) -> TextTable:
         remedy = "if these are trials without a spike, add a line with 0 for each"
         message = f"{numbered}, and are left out as if they had never been: {remedy}"
         table.findings.append(Finding("trials-missing", "warning", message, float(missing)))
+    if table.place(TABLE_COLUMNS["stimulus_time_s"]) is not None:
+        return table
     order = np.argsort(numbers, kind="stable").tolist()
     return replace(table, rows=[table.rows[row] for row in order], lines=[table.lines[row] for row in order])
 

@@ -30,13 +30,22 @@ def series_mismatch(series: Sequence[Responses]) -> str | None:
                     f"{name}: expected the same in all recordings, got {_words(getattr(first, name))} at "
                     f"{in_min(first.start_min)} and {_words(getattr(other, name))} at {in_min(other.start_min)}"
                 )
-        if "pattern" in (first.by or "") and other.pattern_names != first.pattern_names:
-            # Each file numbers its names by itself.
-            names = (f"{each.pattern_names or 'none'} at {in_min(each.start_min)}" for each in (first, other))
-            return f"patterns: expected the same names in all recordings, got {' and '.join(names)}"
+        if "pattern" in (first.by or "") and (different := _differently_named(first, other)):
+            return f"patterns: expected the same names in all recordings, got {different}"
         if others := stimulus_mismatch(first.conditions, other.conditions):
             return f"conditions: {others} at {in_min(other.start_min)}"
     return None
+
+
+def _differently_named(one: Responses, other: Responses) -> str | None:
+    """A pattern's number that has another name in another recording, as each file numbers its names by itself."""
+    ours, theirs = one.pattern_names, other.pattern_names
+    numbers = sorted(ours.keys() & theirs.keys() if ours and theirs else ours.keys() | theirs.keys())
+    different = [number for number in numbers if ours.get(number) != theirs.get(number)]
+    if not different:
+        return None
+    names = (f"{each.pattern_names.get(different[0], 'none')!r} at {in_min(each.start_min)}" for each in (one, other))
+    return f"{' and '.join(names)} for pattern {different[0]}"
 
 
 def unlike_finding(series: Sequence[Responses]) -> Iterator[Finding]:
