@@ -330,6 +330,7 @@ def test_evaluate_says_whose_work_it_is(recordings: Path, policies: Path, capsys
     of_each = last_json(said)["policies"].values()  # type: ignore[attr-defined]
     assert results["rows"][0]["mean_return"] == pytest.approx(np.mean(list(of_each)))
     assert "whose work is it: the same policies" in said and "the robot has only one goal" in said
+    assert not any("bits" in line for line in said.splitlines() if "95 % interval" in line)
     assert main([*command[:2], "--episodes", "2", "--interventions"]) == 1
 
 
