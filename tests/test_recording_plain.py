@@ -798,3 +798,15 @@ def test_a_pattern_that_is_no_number_of_patterns_is_refused(tmp_path: Path) -> N
     (tmp_path / "a_stimuli.csv").write_text("time_s,pattern\n0,5\n0.1,inf\n0.2,10\n")
     with pytest.raises(InvalidFile, match=r"a_stimuli.csv: stimulus_pattern: expected whole numbers, got inf"):
         read_recording(tmp_path / "a_spikes.csv")
+
+
+def test_a_pulse_without_a_number_within_a_trial_does_not_divide_it(tmp_path: Path) -> None:
+    numbers = [-1, 4, -1, 4, 4, -1, 6, -1, -1, 6, 7, -1]
+    of_trials = [0, 1, 1, 1, 1, 2, 3, 3, 3, 3, 4, 5]
+    stimuli = {"stimulus_time_s": 0.1 * np.arange(12), "stimulus_presentation": np.array(numbers)}
+    recording = read_recording(npz(tmp_path, **SPIKES, **stimuli))
+    assert recording.stimuli.presentation.tolist() == of_trials
+    (found,) = [f for f in recording.findings if f.name == "trials-unknown"]
+    assert found.value == 6 and found.message.endswith(
+        "as one trial, but 3 between two pulses of a trial as part of it"
+    )

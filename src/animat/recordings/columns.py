@@ -198,9 +198,14 @@ class PlainColumns:
             # `Stimuli` refuses numbers that fall.
             if not np.any(unknown) or np.any(np.diff(presentations[~unknown]) < 0):
                 return presentations
+            before = np.maximum.accumulate(presentations)
+            rising = np.where(unknown, np.iinfo(np.int64).max, presentations)
+            within = unknown & (before == np.minimum.accumulate(rising[::-1])[::-1])
             message = f"{unknown.sum():,} of {n:,} stimuli have no trial number (-1): each is treated as one trial"
+            message += f", but {within.sum():,} between two pulses of a trial as part of it" if np.any(within) else ""
             noted.append(Finding("trials-unknown", "note", message, float(unknown.sum())))
-            return np.cumsum(np.append(True, np.diff(presentations) != 0) | unknown) - 1
+            presentations = np.where(within, before, presentations)
+            return np.cumsum(np.append(True, np.diff(presentations) != 0) | (unknown & ~within)) - 1
         if (pulses := self.presentation_pulses or 1) > 1 and n:
             raise UnusableData(f"stimulus_presentation: required to know which {pulses} pulses are one trial, got none")
         return np.arange(n)
