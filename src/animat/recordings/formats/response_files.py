@@ -126,7 +126,7 @@ def _by_trial(table: TextTable) -> TextTable:
     if missing := int(last - first) + 1 - len(np.unique(numbers)):
         numbered = f"{missing:,} of the trials {first:.0f} to {last:.0f} have no line"
         remedy = "if these are trials without a spike, add a line with 0 for each"
-        message = f"{numbered}, and are left out as if they had never been: {remedy}"
+        message = f"{numbered}, and are left out: {remedy}"
         table.findings.append(Finding("trials-missing", "warning", message, float(missing)))
     if table.place(TABLE_COLUMNS["stimulus_time_s"]) is not None:
         return table
