@@ -469,3 +469,26 @@ def test_limits_that_are_looser_in_a_new_way_are_refused() -> None:
             CL1Culture(limits=looser).open()
     with CL1Culture(limits=replace(CL1_LIMITS, phase_step_us=40.0, interval_us=12_500.0)) as culture:
         assert culture.is_open
+
+
+def test_a_pulse_that_a_stall_makes_late_delays_those_after_it(
+    neurons: Neurons, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plan, stalls = neurons.create_stim_plan, [250]
+
+    def stalled() -> Any:
+        # The program is held up for 10 ms between the device's time and the plan.
+        neurons.now += stalls.pop() if stalls else 0
+        return plan()
+
+    monkeypatch.setattr(neurons, "create_stim_plan", stalled)
+    with CL1Culture() as culture:
+        culture.deliver([Stimulus(0.0125 * i, (8,), CL1_PULSE) for i in range(5)], 0.1)
+        first = [frame for frame, _, _ in neurons.pulses]
+        assert np.all(np.diff(first) >= 312)
+        stalls.append(250)
+        # Across deliveries the limit holds: 5 ms.
+        culture.deliver([Stimulus(0.0, (8,), CL1_PULSE)], 0.0001)
+        culture.deliver([Stimulus(0.0, (8,), CL1_PULSE)], 0.1)
+    *_, one, other = [frame for frame, _, _ in neurons.pulses]
+    assert other - one >= 125

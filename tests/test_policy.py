@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import math
+import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -585,3 +586,11 @@ def test_an_observation_that_is_not_finite_is_no_action(wrong: float) -> None:
 def test_an_action_is_drawn_from_a_generator_only() -> None:
     with pytest.raises(InvalidArgument, match=r"rng: expected a generator, such as .*, got 0"):
         through_neurons().act(np.zeros(4), 0)  # type: ignore[arg-type]
+
+
+def test_a_folder_that_cannot_be_read_is_not_taken_for_one_without_policies(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "access", lambda path, mode: False)
+    with pytest.raises(InvalidFile, match=r"cannot be read: Permission denied$"):
+        load_policies(tmp_path)

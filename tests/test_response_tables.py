@@ -352,6 +352,13 @@ def test_numbered_trials_are_in_the_order_of_their_numbers_and_missing_ones_are_
     (found,) = [f for f in table.findings if f.name == "trials-missing"]
     assert (found.severity, found.value) == ("warning", float(np.count_nonzero(~some)))
     assert f"{np.count_nonzero(~some)} of the trials 101 to 160 have no line" in found.message
+    (unknown,) = [f for f in table.findings if f.name == "stimulus-times-unknown"]
+    assert "its trials, sorted by their numbers, are assumed to be in order of presentation" in unknown.message
+    # Numbers that count something else.
+    for number in ("1e300", "1790000000"):
+        far = f"trial,channel,count\n{number},0,1\n1,0,2\n2,0,3\n"
+        (tmp_path / "c_responses.csv").write_text(far)
+        assert not [f for f in table_of(tmp_path / "c_responses.csv").findings if f.name == "trials-missing"]
     # Names have no order but that of the file.
     named = [f"t{line}" for line in lines]
     (tmp_path / "b_responses.csv").write_text("\n".join(["trial,channel,count,pattern", *named]) + "\n")

@@ -26,6 +26,7 @@ from animat.closed_loop.log import read_log
 from animat.closed_loop.session import LOG_FILE
 from animat.errors import AnimatError
 from animat.training.policy import CURVE
+from animat.watch.discovery import find
 from animat.watch.session import SessionView
 from animat.watch.study import StudyView
 from animat.watch.training import TrainingView
@@ -277,3 +278,18 @@ def test_the_time_left_for_trials_that_end_many_at_a_time(tmp_path: Path, monkey
             (tmp_path / "journal.jsonl").write_text("".join(trials[: second // 600 * 10]))
             left = dict(view.view(None, 8.0)["blocks"][0]["rows"])["time left for the trials"]
     assert re.fullmatch(r"1\d min|2\d min", left), left
+
+
+def test_a_folder_that_cannot_be_read_is_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("open", "private"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / LOG_FILE).touch()
+    is_file = Path.is_file
+
+    def denied(self: Path) -> bool:
+        if self.parent.name == "private":
+            raise PermissionError(13, "Permission denied", str(self))
+        return is_file(self)
+
+    monkeypatch.setattr(Path, "is_file", denied)
+    assert [item.place for item in find(tmp_path)] == ["open"]

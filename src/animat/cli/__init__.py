@@ -153,6 +153,8 @@ def _error_line(command: Command, error: BaseException) -> str | None:
         return f"interrupted{_how_to_resume(command)}"
     if isinstance(error, OSError) and error.errno == errno.ENAMETOOLONG:
         return f"{str(error.filename)[:60]}...: {error.strerror}; choose a shorter name"
+    if isinstance(error, PermissionError) and error.filename is not None:
+        return f"{error.filename}: {error.strerror}"
     remedy = _MEMORY_REMEDIES.get(type(command), "use a machine with more memory").format(**vars(command))
     return f"{message}: {remedy}" if (message := out_of_memory(error)) else None
 

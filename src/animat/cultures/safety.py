@@ -91,6 +91,12 @@ class History:
                 starts.append(start_ns)
             self.busy_until_ns = end_ns
 
+    def delay_last(self, electrodes: Sequence[int], by_ns: int) -> None:
+        """Count the last stimulus, which was on these electrodes, as begun this much later."""
+        for electrode in (None, *electrodes):
+            self._starts_on[electrode][-1] += by_ns
+        self.busy_until_ns += by_ns
+
     def resume(self, now_ns: int) -> None:
         """Continue in a new session whose clock is at `now_ns`.
 
@@ -173,6 +179,10 @@ class Guard:
                 waited_s += _DELAY_STEP_S
             else:
                 return from_s + waited_s
+
+    def delay_last(self, stimulus: Stimulus, by_s: float) -> None:
+        """Note that the stimulus admitted last may have come later than it was admitted for."""
+        self._history.delay_last(stimulus.electrodes, round(by_s * NS))
 
     def interrupt(self, now_s: float) -> None:
         """Note that a delivery has ended at `now_s`: what it had not delivered counts as delivered just now."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import itertools
 import json
 import math
@@ -385,6 +386,8 @@ def load_policies(path: str | os.PathLike[str]) -> dict[str, Policy]:
         if is_absent(path):
             raise InvalidFile(f"{path}: expected a policy or a folder of policies, got no such file; train them first")
         return {path.stem: Policy.load(path)}
+    if not os.access(path, os.R_OK | os.X_OK):
+        raise InvalidFile(f"{path}: cannot be read: {os.strerror(errno.EACCES)}")
     # Hidden files are unfinished: a process was killed while writing them.
     whole = [file for file in path.glob("*.safetensors") if not file.name.startswith(".")]
     files = sorted(whole, key=lambda file: (len(file.name), file.name))

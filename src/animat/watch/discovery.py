@@ -64,7 +64,8 @@ def _folders(folder: Path) -> Iterator[Path]:
         yield parent
         if depth < _DEPTH:
             _, names, _ = next(os.walk(parent), ("", [], []))
-            skipped = _SKIPPED if any((parent / mark).is_file() for mark in _MARKS.values()) else ()
+            # Unlike `Path.is_file`, this is false in a folder that cannot be read.
+            skipped = _SKIPPED if any(os.path.isfile(parent / mark) for mark in _MARKS.values()) else ()  # noqa: PTH113
             below = [parent / name for name in sorted(names) if name[0] != "." and name not in skipped]
             folders += [(each, depth + 1) for each in below if not each.is_symlink()]
 

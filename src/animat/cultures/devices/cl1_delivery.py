@@ -99,8 +99,8 @@ class CL1Session:
                 # A stop from another thread comes either before the pulse is queued, or after, and then removes it.
                 with self._lock:
                     self._expect_going(len(queued), len(stimuli))
-                    frame = self._queue(waiting.popleft(), requested[len(queued)] + late)
-                late = frame - requested[len(queued)]
+                    frame, latest = self._queue(waiting.popleft(), requested[len(queued)] + late)
+                late = latest - requested[len(queued)]
                 queued.append(frame)
             end = start + int(np.ceil(duration_s * FRAMES_PER_S)) + late
             if not waiting and stop >= max(end, queued[-1] + 1 if queued else 0):
@@ -119,8 +119,12 @@ class CL1Session:
             sent = f"{queued} of {total} stimuli had been sent to the device"
             raise DeviceFailed(f"CL1: stopped while delivering: {sent}, and what had not begun was interrupted")
 
-    def _queue(self, stimulus: Stimulus, frame: int) -> int:
-        """Queue one stimulus on the device, at a frame or as soon as possible after it; returns the frame."""
+    def _queue(self, stimulus: Stimulus, frame: int) -> tuple[int, int]:
+        """Queue one stimulus on the device, at a frame or as soon as possible after it.
+
+        Returns that frame, and the latest at which it comes: if the program was held up meanwhile, the frame may have
+        passed, and the device delivers at once.
+        """
         earliest = int(self.neurons.timestamp()) + self._margin_frames + LEAD_FRAMES
         alone = [replace(stimulus, time_s=0.0)]
         frame = round(self.guard.earliest(alone, max(frame, earliest) / FRAMES_PER_S) * FRAMES_PER_S)
@@ -128,9 +132,11 @@ class CL1Session:
         plan = self.neurons.create_stim_plan()
         plan.stim(self.cl.ChannelSet(*stimulus.electrodes), self._design_of(stimulus.pulse), lead_time_us=LEAD_US)
         plan.run(at_timestamp=frame - LEAD_FRAMES)
+        latest = max(frame, int(self.neurons.timestamp()) + LEAD_FRAMES)
+        self.guard.delay_last(stimulus, (latest - frame) / FRAMES_PER_S)
         if self.stream is not None:
             self.stream.append(frame, json.dumps({**parameters_of(stimulus), "phases": stimulus.pulse.to_list()}))
-        return frame
+        return frame, latest
 
     def _design(self, pulse: Pulse) -> Any:
         return self.cl.StimDesign(*(n for phase in pulse.phases for n in (round(phase.duration_us), phase.amplitude)))

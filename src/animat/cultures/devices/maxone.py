@@ -150,7 +150,8 @@ class MaxOneCulture(Culture):
     @property
     def now_s(self) -> float:
         """Time since it was first opened, by the newest frame received."""
-        return (while_open(self._stream).frame() - self._zero_frame) / FRAMES_PER_S
+        with as_device_failure("MaxOne", "report its time"):
+            return (while_open(self._stream).frame() - self._zero_frame) / FRAMES_PER_S
 
     @property
     def provenance(self) -> dict[str, str]:

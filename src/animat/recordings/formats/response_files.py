@@ -75,7 +75,7 @@ def read_response_table(table: TextTable) -> ResponseTable | None:
     if not _is_response_table(table):
         return None
     is_long = table.place(("channel",)) is not None
-    table = _by_trial(table) if is_long else table
+    as_written, table = table, _by_trial(table) if is_long else table
     values, kind, labels, first_of = _read_long(table) if is_long else _read_wide(table)
     columns: dict[str, Any] = {"channel_label": labels}
     for name, names in TABLE_COLUMNS.items():
@@ -89,7 +89,8 @@ def read_response_table(table: TextTable) -> ResponseTable | None:
     table.note_left_out([alias for name, names in TABLE_COLUMNS.items() if name not in columns for alias in names])
     window_ms = None if start_ms is None or end_ms is None else (start_ms, end_ms)
     provenance = {"source": table.path.name, "format": "CSV of responses"}
-    return _to_table(values, kind, columns, window_ms, provenance, tuple(table.findings))
+    in_order = "its rows are" if table is as_written else "its trials, sorted by their numbers, are"
+    return _to_table(values, kind, columns, window_ms, provenance, tuple(table.findings), in_order)
 
 
 def _read_wide(table: TextTable) -> _Read:
@@ -120,10 +121,11 @@ def _by_trial(table: TextTable) -> TextTable:
         numbers = np.empty(0) if place is None else as_numbers(table.text(place))
     except ValueError:
         return table
-    if not len(numbers) or not np.array_equal(numbers, np.floor(numbers)) or np.any(np.isinf(numbers)):
+    if not len(numbers) or not np.array_equal(numbers, np.floor(numbers)) or np.any(np.abs(numbers) >= 2**53):
         return table
-    first, last = numbers.min(), numbers.max()
-    if missing := int(last - first) + 1 - len(np.unique(numbers)):
+    first, last, present = numbers.min(), numbers.max(), len(np.unique(numbers))
+    # Where most are missing, the numbers do not count trials: times of day, or blocks and trials in one number.
+    if 0 < (missing := int(last - first) + 1 - present) <= present:
         numbered = f"{missing:,} of the trials {first:.0f} to {last:.0f} have no line"
         remedy = "if these are trials without a spike, add a line with 0 for each"
         message = f"{numbered}, and are left out: {remedy}"
@@ -196,8 +198,9 @@ def _to_table(
     window_ms: tuple[float, float] | None,
     provenance: dict[str, str],
     findings: tuple[Finding, ...],
+    in_order: str = "its rows are",
 ) -> ResponseTable:
-    """The table, with stimuli and channels checked like plain columns."""
+    """The table, with stimuli and channels checked like plain columns; `in_order` is in order of presentation."""
     has_times = "stimulus_time_s" in columns
     times = np.asarray(columns.pop("stimulus_time_s", np.arange(len(values), dtype=np.float64)))
     plain = PlainColumns(np.empty(0), np.empty(0, np.int64), times, **columns)
@@ -205,7 +208,7 @@ def _to_table(
     if times.ndim == 1 and len(values) != len(times):
         raise UnusableData(f"responses: expected a row for each of {len(times)} stimuli, got {len(values)}")
     if not has_times:
-        order = "the table has no stimulus times: its rows are assumed to be in order of presentation"
+        order = f"the table has no stimulus times: {in_order} assumed to be in order of presentation"
         findings = (Finding("stimulus-times-unknown", "note", order), *findings)
     recording = plain.to_recording(provenance, findings)
     taken = ("channels", "stimuli", "start_min", "presentation", "provenance", "findings")

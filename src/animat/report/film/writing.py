@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import subprocess
 from collections.abc import Iterator, Sequence
@@ -12,7 +13,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from animat.errors import InvalidArgument, InvalidFile
+from animat.errors import InvalidArgument
 from animat.extras import install_command
 from animat.progress import Progress, Silent
 from animat.report.film.frame import HEIGHT_PX, WIDTH_PX, Frames, pictures_of
@@ -101,4 +102,7 @@ def _write_mp4(pictures: Iterator[Image.Image], path: Path) -> None:
             ffmpeg.kill()
             raise
     if ffmpeg.returncode:
-        raise InvalidFile(f"{path}: cannot be written: {' '.join(message.decode(errors='replace').split())}")
+        full = os.strerror(errno.ENOSPC)
+        said = message.decode(errors="replace").split()
+        # The caller names the file; what ffmpeg says of a full disk is long.
+        raise OSError(full if full in " ".join(said) else " ".join(said))
