@@ -307,6 +307,15 @@ def test_stimuli_before_and_after_the_traces_of_a_reader_leave_spikes_where_they
     # Nothing is installed behind the user's back.
     with_spikeinterface.open_with_spikeinterface(tmp_path / "a.rhd", "maxwell")
     assert given == [{}, {}, {"install_maxwell_plugin": False}]
+    (tmp_path / "a_stimuli.csv").write_text("time_s,frequncy_hz\n0.2,5\n")
+    _, misspelt = with_spikeinterface.open_with_spikeinterface(tmp_path / "a.rhd", "intan")
+    assert [finding.message for finding in misspelt.findings if finding.name == "columns-left-out"] == [
+        "unknown columns of a_stimuli.csv were left out: frequncy_hz (did you mean frequency_hz?)"
+    ]
+    (tmp_path / "a_stimuli.csv").write_text("time_s,presentation\n0.2,2\n0.3,1\n")
+    with pytest.raises(InvalidFile, match=r"a_stimuli\.csv: stimulus_presentation: expected numbers that never fall"):
+        with_spikeinterface.open_with_spikeinterface(tmp_path / "a.rhd", "intan")
+    (tmp_path / "a_stimuli.csv").unlink()
     monkeypatch.setattr(Traces, "get_num_segments", staticmethod(lambda: 2))
     with pytest.raises(InvalidFile, match="expected one segment of traces, got 2"):
         with_spikeinterface.open_with_spikeinterface(tmp_path / "a.rhd", "intan")

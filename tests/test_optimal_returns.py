@@ -17,7 +17,7 @@ from scipy.stats import binom
 from animat.cli import main
 from animat.coding.mapping import Thresholds
 from animat.environment import Animat
-from animat.errors import UnusableData
+from animat.errors import InvalidArgument, UnusableData
 from animat.evaluation.optimal_returns import WellSampled, _coarse, optimal_returns
 from animat.evaluation.optimum import Optimum, best_return, optimal_values
 from animat.evaluation.rollouts import Constant, Uniform, roll_out
@@ -233,3 +233,8 @@ def test_the_interval_holds_the_optimum_of_the_true_distributions(
     print(f"{mapping.name}, {len(spread)} conditions, n = {n}: {held} of {trials}")
     # If coverage were 85 %, fewer would be covered by chance once in a thousand.
     assert held >= binom.ppf(0.001, trials, 0.85)
+
+
+def test_fewer_than_no_resamples_are_refused() -> None:
+    with pytest.raises(InvalidArgument, match=r"^resamples: expected"):
+        optimal_returns(answers([60] * 5, 1), SHORT, resamples=-1)
