@@ -130,7 +130,10 @@ class ControlReturns:
 
 @dataclass(frozen=True)
 class HeuristicComparison:
-    """Trained policies and the heuristic policy: mean returns, Mann-Whitney over episodes, share of pairs won."""
+    """Trained policies and the heuristic policy: mean returns, Mann-Whitney over episodes, share of pairs won.
+
+    `p` is approximate; `p_exact`, which then decides, is None for many episodes.
+    """
 
     robot: str
     arm: str
@@ -140,6 +143,12 @@ class HeuristicComparison:
     p: float
     wins: float
     outcome: str
+    p_exact: float | None = None
+
+    @property
+    def p_best(self) -> float:
+        """The p that decides, as in `animat.evaluation.statistics.EpisodeComparison`."""
+        return self.p if self.p_exact is None else self.p_exact
 
 
 @dataclass(frozen=True)

@@ -30,15 +30,17 @@ def compare_with_heuristic(study: Study, table: DataFrame, spec: RobotSpec) -> I
                 outcome = (OUTPERFORM if found.is_outperformed else NOT) if found.has_enough_episodes else TOO_FEW
                 # The mean of the policies' means, as in the scores: another order of summation can round differently.
                 means = float(mean_returns(episodes).mean()), float(heuristic_returns[at_min].mean())
-                yield HeuristicComparison(spec.name, arm.name, at_min, *means, found.p_best, found.wins, outcome)
+                yield HeuristicComparison(
+                    spec.name, arm.name, at_min, *means, found.p, found.wins, outcome, found.p_exact
+                )
 
 
 def not_outperforming(results: Results) -> list[str]:
     """A sentence for each row whose policies do not outperform the heuristic policy."""
     return [
         f"{row.robot}, {row.arm}, at {row.at_min:g} min: the policies do not outperform the heuristic policy "
-        f"({row.mean_return:.1f} against {row.heuristic:.1f}; p = {row.p:.2g} over episodes"
-        f"{'; they are worse' if is_worse(row.p, row.wins) else ''})"
+        f"({row.mean_return:.1f} against {row.heuristic:.1f}; p = {row.p_best:.2g} over episodes"
+        f"{'; they are worse' if is_worse(row.p_best, row.wins) else ''})"
         for row in results.heuristic
         if row.outcome == NOT
     ]

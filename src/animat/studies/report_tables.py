@@ -173,7 +173,7 @@ def goals_table(results: Results) -> Table:
 def heuristic_table(results: Results) -> Table:
     """Trained policies and the heuristic policy, compared over episodes."""
     columns: Columns = [*columns_of("robot", "arm", "at_min"), ("policies", "mean_return")]
-    columns += [*columns_of("heuristic", "p"), ("pairs won", "wins"), ("the policies", "outcome")]
+    columns += [*columns_of("heuristic"), ("p", "p_best"), ("pairs won", "wins"), ("the policies", "outcome")]
     note = (
         "p: Mann-Whitney over episodes, two-sided. Pairs won: share of pairs of episodes in which the policies' return "
         "is larger, ties counting half. Highlighted: the policies are not shown to outperform it at "
