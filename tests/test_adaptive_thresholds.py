@@ -331,6 +331,7 @@ class Tiring(FakeCulture):
         return replace(observed, spikes=Spikes(observed.spikes.time_s[kept], observed.spikes.channel[kept]))
 
 
+@pytest.mark.oracle
 def test_half_of_the_responses_of_a_culture_that_tires_stay_above_the_median(tmp_path: Path) -> None:
     above: dict[str, float] = {}
     for how in ("fixed", "adaptive"):

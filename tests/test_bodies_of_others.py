@@ -151,6 +151,7 @@ def test_dependence_on_earlier_episodes_is_reported() -> None:
     assert "episodes restart at each checkpoint" in caveat and named("Slider").caveats() == ()
 
 
+@pytest.mark.oracle
 def test_what_was_held_in_an_episode_that_is_not_continued_does_not_count_in_the_next() -> None:
     """The first half of the environments never holds an action itself."""
     on_host = OnHost(training(named("Remembers")).environment(0), SMALL)
@@ -305,6 +306,7 @@ def test_episodes_that_would_never_end_are_refused_before_training() -> None:
     expect_trainable(replace(few, iterations=enough), is_saved=False)
 
 
+@pytest.mark.oracle
 def test_versions_of_all_packages_behind_a_body_are_reported() -> None:
     description = describe_training(Training(robot_named("gymnasium:Pendulum-v1"), None), None)
     assert description["versions"]["gymnasium"] == importlib.metadata.version("gymnasium")
@@ -385,6 +387,7 @@ def test_a_body_that_exits_is_reported_like_one_that_raised(monkeypatch: pytest.
         bodies.begin()
 
 
+@pytest.mark.oracle
 def test_replay_may_take_longer_than_a_step(monkeypatch: pytest.MonkeyPatch) -> None:
     robot = named("Slider")
     first = Bodies(robot, [(1,), (2,)])

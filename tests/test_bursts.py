@@ -181,6 +181,7 @@ def test_a_threshold_that_is_no_share_is_refused(threshold: float) -> None:
         separate_bursts(np.array([0.1, 0.5]), threshold, n_channels=10)
 
 
+@pytest.mark.oracle
 def test_one_hump_has_the_separability_of_theory_and_no_valley() -> None:
     rng = np.random.default_rng(0)
     bell, flat = rng.normal(size=40_000), rng.random(40_000)

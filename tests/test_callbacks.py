@@ -32,6 +32,7 @@ def assert_whole(rows: list[CurveRow], policies: dict[str, Policy]) -> None:
         np.testing.assert_array_equal(reported, policy.learning_curve)
 
 
+@pytest.mark.oracle
 def test_rows_come_while_it_trains_and_change_no_bit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     plain = trained(FOUR, timeline_of(), tmp_path / "plain")
     rows: list[CurveRow] = []

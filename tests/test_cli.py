@@ -266,6 +266,7 @@ def test_evaluate_writes_over_no_file_but_an_evaluation(
         assert (tmp_path / name).read_bytes() == content
 
 
+@pytest.mark.oracle
 def test_a_training_that_is_no_better_than_random_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     train = ["train", "cartpole", "--mapping", "none", "--policies", "1", "--iterations", "480"]
     assert main([*train, "--out", str(tmp_path / "out"), "--json"]) == 0
@@ -276,6 +277,7 @@ def test_a_training_that_is_no_better_than_random_says_so(tmp_path: Path, capsys
     assert "the policies are no better than random actions (" in said.err and "animat validate" not in said.err
 
 
+@pytest.mark.oracle
 def test_what_is_warned_of_is_in_the_json_too(
     recordings: Path, policies: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -300,6 +302,7 @@ def test_what_training_warns_of_is_in_the_json_too(
     assert warned <= {finding["name"] for finding in last_json(said.out)["findings"]}
 
 
+@pytest.mark.oracle
 def test_policies_of_a_training_that_is_not_finished_are_counted(
     recordings: Path, policies: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -355,6 +358,7 @@ def test_evaluate_reports_the_optimum_of_the_recording_it_evaluates_on(
     assert results["rows"][0]["normalised_score"] == pytest.approx(score)
 
 
+@pytest.mark.oracle
 def test_one_of_several_recordings_in_a_file_is_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     parts = (("well000", "rec0000"), ("well001", "rec0000"))
     table = mapping_table([3, 9], [100, 200])

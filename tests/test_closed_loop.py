@@ -289,6 +289,7 @@ def test_the_time_to_decide_is_counted_from_the_data_and_a_pause_is_none_of_it(t
     assert all(0 < tick.wall_s - tick.read_after_s < 0.1 for tick in session.ticks)
 
 
+@pytest.mark.oracle
 @pytest.mark.skipif(not hasattr(os, "SCHED_RR"), reason="the system has no real-time scheduling")
 @pytest.mark.parametrize("real_time", [True, False])
 def test_a_loop_with_deadlines_runs_ahead_of_other_programs_where_it_may(tmp_path: Path, real_time: bool) -> None:
@@ -399,6 +400,7 @@ def test_a_response_on_a_percentile_passes_it_as_in_training(tmp_path: Path) -> 
     assert all(tick.command == (1.0 if tick.spikes >= 2 else -1.0) for tick in session.ticks)
 
 
+@pytest.mark.oracle
 def test_each_condition_leads_in_before_an_episode_and_moves_nothing(tmp_path: Path) -> None:
     class Fixed:
         def act(self, observation: Any, rng: np.random.Generator) -> int:
@@ -511,6 +513,7 @@ def test_a_budget_that_runs_out_in_the_warm_up_ends_the_session(tmp_path: Path) 
     assert_read_alike(tmp_path, loop_of())
 
 
+@pytest.mark.oracle
 def test_bursts_are_handled_as_chosen(tmp_path: Path) -> None:
     sessions = {}
     for how in ("use", "repeat", "skip"):

@@ -309,6 +309,7 @@ def test_a_clock_that_hangs(tmp_path: Path, left: int, little_grace: None) -> No
             released.set()
 
 
+@pytest.mark.oracle
 def test_what_takes_longer_than_the_patience_is_waited_for_if_it_was_asked_for(tmp_path: Path) -> None:
     """The patience counts from when the pause should be over, not from its beginning."""
 
@@ -322,6 +323,7 @@ def test_what_takes_longer_than_the_patience_is_waited_for_if_it_was_asked_for(t
     assert session.ending.by == "plan", session.ending
 
 
+@pytest.mark.oracle
 @pytest.mark.usefixtures("in_the_foreground")
 @pytest.mark.parametrize("is_interrupted", [False, True])
 def test_a_policy_that_hangs(tmp_path: Path, is_interrupted: bool, little_grace: None) -> None:
@@ -373,6 +375,7 @@ def test_ctrl_c_is_not_held_up_by_the_patience_with_an_agent(
     assert (session.ending.by, session.ending.message) == ("person", "stopped by a person (Ctrl-C or kill)")
 
 
+@pytest.mark.oracle
 @pytest.mark.usefixtures("in_the_foreground")
 def test_what_a_culture_answers_after_ctrl_c_is_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("animat.closed_loop.running._UNANSWERED_S", 0.05)
@@ -685,6 +688,7 @@ def pressing(number: signal.Signals) -> Fault:
     return press
 
 
+@pytest.mark.oracle
 @pytest.mark.usefixtures("in_the_foreground")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
 def test_what_was_ignored_when_it_started_does_not_end_a_session(tmp_path: Path, number: signal.Signals) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,9 @@ import pandas as pd
 import pytest
 
 from animat.closed_loop.session import read_session
+from animat.cultures.series import Series
 from animat.errors import InvalidArgument, Mismatch
+from animat.execution.receipts import Receipt, digest_of
 from animat.progress import Silent
 from animat.report.results import ContextRow, LostRow
 from animat.stimulation.protocol import CLOSED_LOOP, TWO_COMMANDS
@@ -25,6 +28,7 @@ from animat.studies.context import (
     run_context_study,
 )
 from animat.studies.context_page import summarise_cultures, summarise_robot, write_context_page
+from synthetic_recordings import write_synthetic_series
 
 
 def row(culture: int, robot: str, **known: Any) -> ContextRow:
@@ -76,6 +80,7 @@ def test_the_page_has_every_number_and_shares_of_what_is_over_random(tmp_path: P
         assert all((tmp_path / f"{name}.{ending}").stat().st_size > 1000 for ending in ("png", "svg", "pdf"))
 
 
+@pytest.mark.oracle
 def test_without_an_optimal_return_values_are_marked_as_lower_bounds(tmp_path: Path) -> None:
     interval = {"score_low_95": 0.5, "score_high_95": 0.7, "gap_low_95": 0.7, "gap_high_95": 0.9}
     known = {"random": -80.0, "policies": 10.0, "best_known": 20.0, "gap": 0.8, "score": 0.6}
@@ -112,6 +117,29 @@ def test_a_recording_is_over_when_the_next_one_is_due(
     # Recordings that take too long are refused before earlier ones are looked for.
     with pytest.raises(NotImplementedError, match="earlier recordings"):
         RecordCulture(ContextStudy(), 1, n_commands).run(tmp_path, Silent())
+
+
+@pytest.mark.parametrize("n_commands", [1, 2])
+def test_a_recording_that_changed_is_recorded_again(
+    n_commands: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    study = ContextStudy(cultures=(1,), robots=("shuttle", "detour"))
+    job = next(each for each in plan_context_study(study) if each.task == RecordCulture(study, 1, n_commands))
+    folder = RecordCulture(study, 1, n_commands).recordings(tmp_path, n_commands)
+    changed, same = write_synthetic_series(1, folder, sessions=2, channels=32, patterns=20)
+    outputs = {file.relative_to(tmp_path).as_posix(): digest_of(file) for file in (changed, same)}
+    Receipt(job.name, "x", {}, outputs).save(tmp_path / "jobs")
+    # It can still be read.
+    shutil.copy(same, changed)
+    found: list[Path] = []
+
+    def record_again(*_: object, **__: object) -> Series:
+        found.extend(folder.iterdir())
+        return Series([], [])
+
+    monkeypatch.setattr("animat.studies.context.record_series", record_again)
+    RecordCulture(study, 1, n_commands).run(tmp_path, Silent())
+    assert found == [same]
 
 
 def test_a_folder_of_something_else_is_left_alone(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -16,6 +17,7 @@ from animat.recordings.conversion import Origin, convert_recording
 from animat.recordings.detection.settings import Detection
 from animat.recordings.formats import with_spikeinterface
 from animat.recordings.reading import read_recording
+from animat.recordings.recording import Recording
 from rig_files import event_table, mapping_table, spike_table, write_cl1, write_maxwell
 from test_detection import noisy
 from test_rig_readers import other_nwb
@@ -189,6 +191,21 @@ def test_a_file_is_not_written_over_itself(tmp_path: Path) -> None:
     assert path.read_bytes() == before
 
 
+def test_a_file_that_another_program_wrote_in_the_meantime_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, out = rig_file("npz", tmp_path), tmp_path / "out.nwb"
+
+    def read(*given: Any, **named: Any) -> Recording:
+        out.write_text("another program's")
+        return read_recording(*given, **named)
+
+    monkeypatch.setattr("animat.recordings.conversion.read_recording", read)
+    with pytest.raises(InvalidArgument, match="--out: expected a new file, got"):
+        convert_recording(path, out)
+    assert out.read_text() == "another program's"
+
+
 @pytest.mark.parametrize("name", ["x.csv", "x", "x.nwb.gz"])
 def test_the_output_name_must_end_in_nwb(name: str, tmp_path: Path) -> None:
     with pytest.raises(InvalidArgument, match=r"^--out: expected a name ending in \.nwb, as NWB is written, got "):
@@ -269,6 +286,7 @@ def test_traces_that_spikeinterface_reads(tmp_path: Path) -> None:
     assert abs(len(written.spike_times_s) - sum(map(len, truth))) <= 3
 
 
+@pytest.mark.oracle
 def test_stimuli_before_and_after_the_traces_of_a_reader_leave_spikes_where_they_are(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

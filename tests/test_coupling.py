@@ -164,6 +164,7 @@ def optimum_of(value: float, grid_error: float = 0.0) -> Optimum:
     return Optimum(value, grid_error, value, 0.0, value, 0.0, 1000, 1)
 
 
+@pytest.mark.oracle
 def test_the_gaps_interval_is_that_of_a_bootstrap() -> None:
     rng = np.random.default_rng(5)
     of_coupling, at_random = rng.normal(40, 20, 400), rng.normal(-10, 30, 400)

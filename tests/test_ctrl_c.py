@@ -77,6 +77,7 @@ def test_an_import_is_not_cut_short(number: signal.Signals, tmp_path: Path, monk
     assert sys.modules.pop(name).whole
 
 
+@pytest.mark.oracle
 def test_two_in_one_import_raise_once(tmp_path: Path, monkeypatch) -> None:
     """So that the second does not cut short what the first one's end closes."""
     monkeypatch.syspath_prepend(tmp_path)

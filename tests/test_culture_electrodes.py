@@ -198,6 +198,7 @@ def test_the_strength_of_a_pulse_is_its_cathodic_charge() -> None:
     assert answer(anodic) < answer(half) < published
 
 
+@pytest.mark.oracle
 def test_a_state_goes_on_bit_for_bit(tmp_path: Path) -> None:
     with small_culture() as culture:
         culture.record(SHORT, seed=1)

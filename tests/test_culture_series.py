@@ -81,6 +81,7 @@ def test_a_series_has_its_recordings_at_their_minutes(undisturbed: list[Path]) -
     assert sorted(p.name for p in folder.iterdir() if p.suffix != ".nwb") == [STATE_FILE, "selection.json"]
 
 
+@pytest.mark.oracle
 def test_it_is_longer_when_asked_again_for_more(undisturbed: list[Path], tmp_path: Path) -> None:
     record(tmp_path / "a", sessions=1)
     record(tmp_path / "a", sessions=2)
@@ -115,6 +116,7 @@ def test_whatever_is_lost_comes_back_the_same(undisturbed: list[Path], tmp_path:
     assert same(record(folder), undisturbed)
 
 
+@pytest.mark.oracle
 def test_a_state_that_is_behind_its_recordings_catches_up(undisturbed: list[Path], tmp_path: Path) -> None:
     # As if killed between a recording and the state after it.
     record(tmp_path / "behind", sessions=1)

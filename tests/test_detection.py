@@ -433,6 +433,7 @@ def test_channels_are_counted_once_at_each_pulse_wherever_pieces_begin() -> None
     assert {finding.name: finding.value for finding in found.findings}["saturated-channels"] == 0.5
 
 
+@pytest.mark.oracle
 def test_an_amplifier_that_is_mostly_saturated_is_blanked_wherever_pieces_begin() -> None:
     voltage, truth = noisy(4, 20.0)
     # At rest it is at -2 mV, which is as far from 0 as what it saturates at.

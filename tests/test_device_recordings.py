@@ -233,6 +233,7 @@ def test_what_a_killed_run_left_is_kept_by_the_next(tmp_path: Path, monkeypatch:
     assert not list(tmp_path.glob(".*"))
 
 
+@pytest.mark.oracle
 def test_a_fast_protocol_is_cut_too_and_little_observed_is_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
     culture, run_on, *_ = on_maxone(monkeypatch)
     protocol = Protocol(**vars(MIXED) | {"pulse": BALANCED_PULSE, "frequencies_hz": (20, 40), "trials": 2000})
@@ -250,6 +251,7 @@ def test_a_fast_protocol_is_cut_too_and_little_observed_is_a_warning(monkeypatch
     assert finding.value == pytest.approx(6 / recording.duration_s, rel=0.01)
 
 
+@pytest.mark.oracle
 def test_what_a_killed_run_left_stays_where_it_cannot_be_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     culture, *_ = on_maxone(monkeypatch)
     with culture:

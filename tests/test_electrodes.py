@@ -150,6 +150,7 @@ def test_every_possible_pattern_is_found_and_one_more_is_too_many() -> None:
         draw_patterns(SMALL, electrodes, patterns=1, size=8, spacing_um=1.0, seed=0)
 
 
+@pytest.mark.oracle
 def test_a_draw_that_finds_hardly_any_pattern_ends() -> None:
     far = np.array([220 * 25 * i + 25 * j + 1_000 for i in range(4) for j in range(6)])
     with pytest.raises(InvalidArgument, match="24 electrodes found only 0"):

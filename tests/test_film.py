@@ -137,6 +137,7 @@ def test_a_gif_lasts_as_long_as_its_span_and_moves(
 
 
 # What counts the pictures forks.
+@pytest.mark.oracle
 @pytest.mark.filterwarnings("ignore:os.fork:RuntimeWarning")
 def test_an_mp4_has_as_many_pictures_as_it_should(folder: Path, tmp_path: Path) -> None:
     ffmpeg = pytest.importorskip("imageio_ffmpeg")

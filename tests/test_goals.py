@@ -379,6 +379,7 @@ def test_where_a_body_stays_within_the_grid_any_goal_has_an_optimum(name: str, g
     assert why_no_grid(with_goal(name, goal)) is None
 
 
+@pytest.mark.oracle
 def test_an_end_that_a_command_decides_is_not_known_from_the_state() -> None:
     grid = grid_for(with_goal("cartpole", CARTPOLE))
     assert grid.end_is_known and grid.smooth_commands == grid_for(Cartpole()).smooth_commands
@@ -454,6 +455,7 @@ def parts(draw: Any) -> Range | Ball:
     return draw(st.sampled_from([Range(name, low, high, unit, True), Range(name, low, high, unit), Range(name, None, high, unit)]))  # fmt: skip  # noqa: E501
 
 
+@pytest.mark.oracle
 @settings(max_examples=200, deadline=None)
 @given(st.lists(st.tuples(st.sampled_from(["avoid", "reach", "drive"]), st.lists(parts(), min_size=1, max_size=3),
                           st.floats(1e-3, 1e3), st.none() | st.integers(1, 99)), min_size=1, max_size=4))  # fmt: skip

@@ -220,6 +220,7 @@ def test_a_simulator_decides_how_the_neurons_answer() -> None:
     assert all(info["rate_hz"] == 0 and info["command"] == -1 for info in infos)
 
 
+@pytest.mark.oracle
 def test_shuffled_delivery_says_what_was_delivered() -> None:
     infos = rollout(gymnasium.make("Animat/Navigation-v0", delivery="shuffled"), [2] * 2000)[4]
     counts = np.bincount([info["delivered"] for info in infos], minlength=5)
@@ -542,6 +543,7 @@ def test_vector_and_single_have_the_same_returns() -> None:
     assert -90 < vector.mean() < -70
 
 
+@pytest.mark.oracle
 @pytest.mark.parametrize("id_", IDS)
 def test_pictures_show_the_robot_as_it_moves(id_: str) -> None:
     env = gymnasium.make(id_, render_mode="rgb_array")
@@ -559,6 +561,7 @@ def test_pictures_show_the_robot_as_it_moves(id_: str) -> None:
     assert [picture.shape for picture in envs.render()] == [first.shape] * 3
 
 
+@pytest.mark.oracle
 def test_what_is_found_in_several_recordings_is_warned_of_once(tmp_path: Path) -> None:
     for number in range(3):
         synthetic = synthetic_recording(1, start_min=30.0 * number, patterns=4, channels=16)

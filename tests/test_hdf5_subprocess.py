@@ -54,6 +54,7 @@ def test_any_error_in_reading_names_the_file(path: Path, monkeypatch: pytest.Mon
         hdf5_subprocess.read_hdf5_in_subprocess(path)
 
 
+@pytest.mark.oracle
 def test_a_dead_process_is_replaced(path: Path) -> None:
     before = read_recording(path)
     assert hdf5_subprocess._reader is not None

@@ -74,6 +74,7 @@ def test_invalid_selections_are_refused_in_one_line(changed: dict[str, Any], wor
         Selection.load(tmp_path / "s.json")
 
 
+@pytest.mark.oracle
 def test_a_checkpoint_that_unpacks_to_more_than_one_holds_is_not_read(tmp_path: Path) -> None:
     group = Group(SHORT, (0,), timeline_of(), "f", {})
     np.savez_compressed(tmp_path / "c.npz", fingerprint=np.array("f"), more=np.zeros(2**24))

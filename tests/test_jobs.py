@@ -119,6 +119,7 @@ def test_what_is_lost_or_changed_is_done_again_and_what_rests_on_other_bytes(tmp
     assert run(other, tmp_path, of="another study") == {"a", "b", "c"}
 
 
+@pytest.mark.oracle
 def test_progress_goes_up_to_all_and_says_what_runs(tmp_path: Path) -> None:
     # A run that was killed left its last words.
     stale = receipt_path(tmp_path / ".unfinished" / ".notices", "b")
@@ -134,6 +135,7 @@ def test_progress_goes_up_to_all_and_says_what_runs(tmp_path: Path) -> None:
     assert not any("nearly" in note for note in notes)
 
 
+@pytest.mark.oracle
 def test_the_share_done_counts_jobs_of_earlier_runs(tmp_path: Path) -> None:
     first = joined("a", cost_s=3.0)
     run([first], tmp_path)
@@ -228,6 +230,7 @@ def test_ours_end_at_once_where_one_fails(tmp_path: Path) -> None:
     assert not (tmp_path / "runs").exists()
 
 
+@pytest.mark.oracle
 def test_ctrl_c_ends_processes_of_ours_that_several_plans_share(tmp_path: Path) -> None:
     class Interrupted:
         def update(self, done: float, total: float, note: str = "") -> None:
@@ -262,6 +265,7 @@ def test_no_two_jobs_have_one_receipt(tmp_path: Path) -> None:
     assert len({receipt_path(tmp_path, job) for job in jobs}) == 3
 
 
+@pytest.mark.oracle
 def test_a_recording_is_known_by_what_it_says_not_by_what_nwb_adds(tmp_path: Path) -> None:
     for name, seed in (("a", 1), ("again", 1), ("other", 2)):
         write_nwb(synthetic_recording(seed, patterns=5, channels=16), tmp_path / f"{name}.nwb")

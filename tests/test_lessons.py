@@ -511,6 +511,7 @@ def test_a_robot_with_a_goal_is_varied_as_its_body_is() -> None:
         check_lessons([Lesson(parameters={"goal": (0.0, 1.0)})], with_goal(Cartpole(), goal), draws_recordings=False)
 
 
+@pytest.mark.oracle
 def test_a_best_policy_that_is_lost_is_trained_again(tmp_path: Path) -> None:
     training = replace(SHORT, assess=2)
     trained(training, timeline_of(), tmp_path)

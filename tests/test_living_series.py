@@ -48,6 +48,7 @@ def replay() -> ReplayCulture:
     return ReplayCulture([synthetic_recording(1, channels=32, start_min=30.0)], seed=3)
 
 
+@pytest.mark.oracle
 def test_a_replay_is_recorded_at_its_minutes(tmp_path: Path) -> None:
     with replay() as culture:
         series = record_series(
@@ -205,6 +206,7 @@ def maxone(patch: pytest.MonkeyPatch) -> tuple[Culture, Callable[[], list[float]
     return culture, lambda: sorted({pulse.frame / 20_000 for pulse in rig.delivered})
 
 
+@pytest.mark.oracle
 @pytest.mark.parametrize("make", [cl1, maxone])
 def test_devices_are_recorded_by_the_same_calls(
     make: Callable[[pytest.MonkeyPatch], tuple[AbstractContextManager[Culture], Callable[[], list[float]]]],

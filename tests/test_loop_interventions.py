@@ -87,6 +87,7 @@ def test_a_burst_of_the_culture_is_none_of_the_response_that_is_drawn_in_its_pla
         assert (tick["spikes"], tick["active_ratio"], tick["readout_hz"]) == (16, 1.0, ())
 
 
+@pytest.mark.oracle
 def test_yoked_stimuli_are_those_of_a_policy_s_episode_before(session: Session, tmp_path: Path) -> None:
     # A cartpole may stay upright for longer than in the episode that is repeated.
     agents = [Agent("p0", "as trained", POLICIES["p0"]), *(a for a in changed(Cartpole()) if a.name == "yoked")]

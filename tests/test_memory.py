@@ -321,6 +321,7 @@ def network_of_its_own(n: int, seed: int) -> Responses:
     return replace(responses_of(*[[1.0]] * 3), presented=None, place=None, conditions=conditions, **columns)
 
 
+@pytest.mark.oracle
 def test_where_stimuli_leave_no_trace_a_response_counts_by_its_difference_from_the_mean() -> None:
     """The same stimulus again and again is then answered as among others: on average the noise is 0."""
     for seed in (1, 2):
@@ -715,6 +716,7 @@ def test_without_memory_in_the_responses_there_is_mostly_none_in_the_simulator()
     )
 
 
+@pytest.mark.oracle
 def test_without_memory_none_is_found_where_responses_are_of_few_spikes() -> None:
     """Many responses are the same then, and histories too."""
     found = []
@@ -879,6 +881,7 @@ def test_what_a_simulator_without_memory_keeps_is_all_of_its_responses(seed: int
     assert not kept.findings(of_memory=True)
 
 
+@pytest.mark.oracle
 def test_what_a_simulator_with_memory_keeps_is_what_many_draws_come_to() -> None:
     responses = chain(400, after_low=(0.1, 0.5), after_high=(0.5, 0.9))
     simulator = fit_memory(responses)
@@ -902,6 +905,7 @@ def test_too_few_neighbours_are_reported() -> None:
     assert all(finding.name != "binning" for finding in fit_timeline([few], kind="memory").findings)
 
 
+@pytest.mark.oracle
 def test_training_reports_the_memory() -> None:
     series = [chain(500, after_low=(0.1, 0.5), after_high=(0.5, 0.9)), replace(independent(0), start_min=10.0)]
     series[1] = replace(series[1], condition=series[1].condition % 2, conditions=series[0].conditions)

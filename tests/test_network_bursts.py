@@ -59,6 +59,7 @@ def test_a_recording_without_stimuli_is_described(tmp_path: Path, capsys: pytest
     assert [file.name for file in (tmp_path / "figures").iterdir()] == ["a-raster.png"]
 
 
+@pytest.mark.oracle
 def test_one_burst_is_reported_in_the_singular_and_wide_bins_are_stated() -> None:
     text = inspection_text(inspect_recording(spontaneous([100.1])))
     assert "  1 network burst (" in text and "(median) contains " in text and "in bins of" not in text

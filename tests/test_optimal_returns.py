@@ -112,6 +112,7 @@ def answers(n: Sequence[int], seed: int, spread: Sequence[float] = SPREAD) -> Re
     )
 
 
+@pytest.mark.oracle
 def test_a_surpassed_optimum_has_no_context_gap(monkeypatch: pytest.MonkeyPatch) -> None:
     low = Optimum(-60.0, 1.0, 50.0, 2.0, 40.0, 2.0, 100, 10)
     for name, stand_in in {

@@ -136,6 +136,7 @@ class FromEitherSide(Stairs):
         return StairState(jnp.where(jax.random.uniform(key) < 0.5, 1.0, 3.0))
 
 
+@pytest.mark.oracle
 def test_random_starts_are_averaged_over() -> None:
     """With a fair coin the top comes first with probability 1/4 from below the middle, 3/4 from above it."""
     environment = Animat(FromEitherSide(), Thresholds(1), 2)

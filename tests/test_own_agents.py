@@ -237,6 +237,7 @@ def test_an_agent_that_cannot_act_is_refused_in_one_line(name: str, agent: Any, 
     evaluate({"p0": policy}, timeline, episodes=3, controls=[], agents={"mine": Plain()})
 
 
+@pytest.mark.oracle
 def test_an_agent_runs_beside_policies_with_its_own_prediction(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("animat.reality_gap.calibration.BOOTSTRAPS", 4)
     with FakeCulture() as culture:
@@ -376,6 +377,7 @@ def test_in_a_loop_it_begins_anew_too(tmp_path: Path) -> None:
     assert all(condition == (0 if iteration < 3 else 4) for _, iteration, condition in chosen)
 
 
+@pytest.mark.oracle
 @pytest.mark.parametrize("is_on_host", [False, True])
 def test_ctrl_c_is_not_held_until_the_last_episode(is_on_host: bool, in_the_foreground: None) -> None:
     asked = 0

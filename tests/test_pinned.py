@@ -25,6 +25,7 @@ def one() -> Iterator[Executor]:
         yield executor
 
 
+@pytest.mark.oracle
 @pytest.mark.skipif(not Path("/proc/self/cmdline").exists(), reason="the processes of others are not known here")
 def test_a_run_takes_the_cores_that_others_leave(one: Executor, monkeypatch: pytest.MonkeyPatch) -> None:
     one.submit(divmod, 7, 2).result()
@@ -76,6 +77,7 @@ def test_work_whose_process_dies_fails_and_the_next_gets_another_process(one: Ex
     assert one.submit(rest, 0.0).result() == 0.0
 
 
+@pytest.mark.oracle
 def test_left_by_an_error_it_ends_what_runs() -> None:
     with pytest.raises(ValueError, match="no"), PinnedProcesses([CORE, CORE]) as executor:
         process, _ = executor.submit(describe_process).result()

@@ -94,6 +94,7 @@ def test_electrode_pulses_by_hand() -> None:
         assert electrode_pulses([rests, unknown], 2) is None
 
 
+@pytest.mark.oracle
 @settings(max_examples=20, deadline=None)
 @given(
     actions=st.lists(st.integers(0, 2), min_size=1, max_size=12),

@@ -132,6 +132,7 @@ def without_controls(tmp_path_factory: pytest.TempPathFactory, series: list[Resp
         return *run(tmp_path_factory.mktemp("run"), series, with_controls=False, report=lines.append), lines
 
 
+@pytest.mark.oracle
 @pytest.mark.parametrize(("percentiles", "adaptive"), [("moving", True), ("first", False)])
 def test_recordings_before_the_policies_first_one_are_not_used(
     percentiles: str, adaptive: bool, series: list[Responses], monkeypatch: pytest.MonkeyPatch
@@ -801,6 +802,7 @@ def test_a_loop_delivers_what_its_recording_was_made_with(
     assert ("unknown-pulse" in {finding.name for finding in gap.findings}) == (case == "unknown")
 
 
+@pytest.mark.oracle
 @pytest.mark.usefixtures("few_bootstraps")
 def test_another_culture_than_the_recorded_one_is_noticed_from_python_too(
     tmp_path: Path, series: list[Responses], calibration: Calibration
@@ -819,6 +821,7 @@ def test_another_culture_than_the_recorded_one_is_noticed_from_python_too(
     assert found == [[], ["other-channels", "other-patterns"]]
 
 
+@pytest.mark.oracle
 @pytest.mark.usefixtures("few_bootstraps")
 def test_a_table_that_cannot_be_written_is_still_returned(
     tmp_path: Path, series: list[Responses], calibration: Calibration
@@ -836,6 +839,7 @@ def test_a_table_that_cannot_be_written_is_still_returned(
     assert "returns.txt" in gap.session.ending.message and "cannot be written" in gap.to_text()
 
 
+@pytest.mark.oracle
 @pytest.mark.usefixtures("few_bootstraps")
 def test_returns_are_predicted_from_the_starts_of_the_session(
     tmp_path: Path, series: list[Responses], calibration: Calibration
@@ -975,6 +979,7 @@ def test_a_prediction_is_more_certain_with_more_recorded_responses() -> None:
     assert 2.5 < widths[0] / widths[1] < 6
 
 
+@pytest.mark.oracle
 @pytest.mark.usefixtures("few_bootstraps")
 def test_the_heuristic_policy_is_the_same_on_simulator_and_culture(calibration: Calibration) -> None:
     simulator = calibration.simulator
@@ -1091,6 +1096,7 @@ def test_a_recording_much_older_than_the_culture_is_reported(
     assert [finding.value for finding in found] == ([pytest.approx(age_min)] if warned else [])
 
 
+@pytest.mark.oracle
 @pytest.mark.usefixtures("few_bootstraps")
 def test_on_a_device_whose_clock_started_anew_a_recordings_date_tells_its_age(
     tmp_path: Path, series: list[Responses]
@@ -1211,6 +1217,7 @@ class TestCommand:
         assert self.command(folder) == 1
         assert "STOP: expected none yet, as it ends a session: remove it first" in capsys.readouterr().err
 
+    @pytest.mark.oracle
     def test_a_recording_that_could_not_be_written_is_an_error(
         self, folder: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
@@ -1222,6 +1229,7 @@ class TestCommand:
         assert "animat recover" in printed.err
         assert f"recording: {folder}" not in printed.out
 
+    @pytest.mark.oracle
     def test_without_room_for_its_files_no_pulse_is_delivered(
         self, folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
     ) -> None:
@@ -1238,6 +1246,7 @@ class TestCommand:
                 said = capsys.readouterr().err.splitlines()[-1]
                 assert re.search(r"new: expected .* MB free for the output, got 0.00 MB: make room, or choose", said)
 
+    @pytest.mark.oracle
     def test_a_polite_kill_closes_the_culture(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         def kill(culture: FakeCulture, observed: Observed) -> Observed:
             os.kill(os.getpid(), signal.SIGTERM)
@@ -1253,6 +1262,7 @@ class TestCommand:
         assert culture.deliveries <= 2
         assert signal.getsignal(signal.SIGTERM) is before
 
+    @pytest.mark.oracle
     def test_a_culture_that_cannot_be_closed_costs_no_table(
         self, folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
     ) -> None:
@@ -1287,6 +1297,7 @@ class TestCommand:
             assert "not patterns of this culture" in said if words else "pattern" not in said
             assert (words or "") in said
 
+    @pytest.mark.oracle
     def test_a_spent_budget_is_reported_and_an_error(self, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert self.command(folder, "--budget-pulses", "50", "--controls", "random") == 1
         printed = capsys.readouterr()

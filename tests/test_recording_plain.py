@@ -194,6 +194,7 @@ def test_text_may_be_bytes_and_a_pattern_without_a_name_is_unknown(tmp_path: Pat
     assert recording.presentation == Presentation("blocked")
 
 
+@pytest.mark.oracle
 @FEW
 @given(data=st.data(), steps=st.lists(st.integers(-20, 20), max_size=25))
 def test_the_order_of_spikes_and_stimuli_in_the_file_does_not_matter(

@@ -35,6 +35,7 @@ def mixed(seed: int, *, of_its_own: float = 0.0, of_the_last: float = 0.0, silen
     return replace(shape, **columns, time_s=time_s, presented=presented, place=np.arange(N))
 
 
+@pytest.mark.oracle
 @given(st.integers(0, 10_000))
 def test_responses_after_their_own_condition_are_found_to_differ_only_where_they_do(seed: int) -> None:
     (found,) = repetition_findings(mixed(seed, of_its_own=3.0))

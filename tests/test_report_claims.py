@@ -544,6 +544,7 @@ def test_an_interval_that_leaves_the_scale_ends_in_an_arrow() -> None:
     assert legend(figure) == said
 
 
+@pytest.mark.oracle
 def test_on_a_phone_the_headline_fits_the_screen(tmp_path: Path) -> None:
     rows = [
         (score(robot, arm, 5.0, 4.0, 6.0, 0.0, 10.0), np.array([3.0, 7.0]))

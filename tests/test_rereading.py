@@ -106,6 +106,7 @@ def test_of_readouts_each_is_read_by_its_own_and_bursts_move_nothing() -> None:
     np.testing.assert_array_equal(read(bursts).rate_hz[~is_burst], read(far).rate_hz[~is_burst])
 
 
+@pytest.mark.oracle
 def test_which_predictions_use_it() -> None:
     rng = np.random.default_rng(5)
     responses = replace(mixed(rng, 1_000, np.sin(np.arange(1_000) / 60)), presentation=Presentation("mixed", 1))
@@ -121,6 +122,7 @@ def test_which_predictions_use_it() -> None:
     np.testing.assert_array_equal(linear.simulator.percentiles, fixed.simulator.percentiles)
 
 
+@pytest.mark.oracle
 def test_what_policies_see_of_the_neurons_is_remembered_as_the_loop_has_it(monkeypatch: pytest.MonkeyPatch) -> None:
     with FakeCulture() as culture:
         recorded = extract_responses(culture.record(PROTOCOL, 0), burst_threshold=0.95)

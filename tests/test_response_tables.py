@@ -410,6 +410,7 @@ def test_spikes_by_name_are_no_table(suffix: str, tmp_path: Path) -> None:
     assert not isinstance(read_source(tmp_path / f"b_spikes{suffix}"), ResponseTable)
 
 
+@pytest.mark.oracle
 def test_the_window_of_a_policy_is_none_that_was_given(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     counts = np.random.default_rng(1).poisson([[1.0] * 8, [3.0] * 8] * 150)
     columns: dict[str, Any] = {"response_count": counts, "stimulus_frequency_hz": np.tile([5.0, 20.0], 150)}

@@ -183,6 +183,7 @@ def test_minutes_have_two_decimals_at_most(minutes: float, text: str) -> None:
     assert in_min(minutes) == text
 
 
+@pytest.mark.oracle
 def test_a_rehearsal_of_currents_is_given_voltages(
     series: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -191,6 +192,7 @@ def test_a_rehearsal_of_currents_is_given_voltages(
     assert f"each pulse: {PUBLISHED_PULSE}" in capsys.readouterr().err.splitlines()
 
 
+@pytest.mark.oracle
 @pytest.mark.parametrize(
     ("pulses", "file", "words"),
     [
@@ -354,6 +356,7 @@ def test_whatever_was_recorded_is_run(by: str, series: Path, tmp_path: Path, sma
     assert set(stimuli.pattern.tolist()) <= set(recorded.pattern.tolist())
 
 
+@pytest.mark.oracle
 def test_policies_of_before_are_run_as_their_recordings_tell(series: Path, tmp_path: Path, small_ones: None) -> None:
     """Files of 0.1.0 have the name of a pattern, and not its electrodes."""
     policy = over(series, "pattern:1,6,4")

@@ -91,6 +91,7 @@ def test_each_loss_moves_its_own_parameters_only(commands: int) -> None:
             assert moved == (name == loss), f"{loss} loss, parameters of {name}"
 
 
+@pytest.mark.oracle
 @pytest.mark.parametrize("commands", COMMANDS)
 def test_gradients_equal_finite_differences_of_the_reference(commands: int) -> None:
     trained, targets, batch, uniforms = problem(2, commands=commands)

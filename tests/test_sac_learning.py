@@ -107,6 +107,7 @@ def test_the_replay_holds_the_newest_rounds_each_in_its_place(rounds: int) -> No
     assert float(finished.episodes) == 2 * (rounds // limit)
 
 
+@pytest.mark.oracle
 def test_terminations_are_remembered_and_episodes_start_anew() -> None:
     environment = WithoutNeurons(Payer(ends=True, shows_iteration=True), DISCRETE)
     rows = np.asarray(trained_for(environment, SMALL, 5)[0].replay)

@@ -117,6 +117,7 @@ def test_responses_over_time_mark_each_median(series: list[Responses]) -> None:
     assert draw_responses_over_time(many).get_suptitle() == "20 of 50 recordings"
 
 
+@pytest.mark.oracle
 @pytest.mark.parametrize("draw", [draw_response_histograms, lambda each: draw_responses_over_time([each] * 2)])
 def test_titles_of_many_electrodes_are_whole_and_do_not_overlap(draw: Any) -> None:
     labels = conditions_named("electrode")

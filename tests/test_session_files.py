@@ -52,6 +52,7 @@ def test_the_recording_states_its_pulse(tmp_path: Path) -> None:
         write_nwb(wrong, tmp_path / "wrong.nwb")
 
 
+@pytest.mark.oracle
 def test_what_was_predicted_and_measured_is_recovered(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     predicted = {"random": Interval(-1.25, -2.0, 3.0)}
     with FakeCulture(3) as culture:

@@ -107,6 +107,7 @@ def test_every_draw_is_a_recorded_trial_with_all_its_readouts(kind: str) -> None
         assert {tuple(x) for x in of.tolist()} == known
 
 
+@pytest.mark.oracle
 def test_memory_chooses_the_trial_that_it_would_with_one_readout() -> None:
     """The history is of all channels; a trial that is drawn only adds the responses of its readouts."""
     responses, memory = of_halves(), Memory(0.3, 0.5, 0.7)

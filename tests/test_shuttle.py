@@ -68,6 +68,7 @@ def test_what_is_right_at_one_place_is_wrong_at_the_other(cue: float) -> None:
     np.testing.assert_array_equal(rewards, cue * inside)
 
 
+@pytest.mark.oracle
 def test_the_heuristic_stays_at_its_place_and_no_constant_command_gains() -> None:
     environment = WithoutNeurons(Shuttle(), None)
     by_rule = roll_out(environment, None, HeuristicPolicy(), episodes=200, seed=1).returns

@@ -443,6 +443,7 @@ def test_the_first_recording_is_the_first_in_time_not_by_name(tmp_path: Path, mo
     assert sum(bool(row["channel"]) for row in rows(folder / "tables" / "culture-array.csv")) == 24
 
 
+@pytest.mark.oracle
 def test_recordings_whose_names_would_be_one_are_refused(tmp_path: Path) -> None:
     for i, start_min in enumerate((1234567.0, 1234567.25)):
         write_nwb(synthetic_recording(1, start_min=start_min, patterns=5, channels=16), tmp_path / f"{i}.nwb")
@@ -1002,6 +1003,7 @@ def test_comparisons_are_made_at_the_nearest_recording() -> None:
             at([beyond], start_min)
 
 
+@pytest.mark.oracle
 def test_a_comparison_moved_to_another_minute_is_reported(tmp_path: Path) -> None:
     write_synthetic_series(1, tmp_path / "made", sessions=2, interval_min=30.0, patterns=10, channels=16)
     moved = Compared("before and after", "1 threshold", "control", at_min=29.0)
@@ -1018,6 +1020,7 @@ def test_a_comparison_moved_to_another_minute_is_reported(tmp_path: Path) -> Non
         FitSimulators(replace(study, comparisons=(replace(moved, at_min=99.0),))).run(tmp_path / "study", Silent())
 
 
+@pytest.mark.oracle
 def test_recordings_that_leave_nothing_to_choose_are_refused(tmp_path: Path) -> None:
     write_synthetic_series(1, tmp_path / "made", sessions=1, patterns=10, channels=16)
     one = Study(culture=Source("files", files=("made",)), simulators=Simulators(conditions="all"))

@@ -84,6 +84,7 @@ def test_a_study_s_policies_are_those_of_the_same_training_by_hand(tmp_path: Pat
             np.testing.assert_array_equal(one, other)
 
 
+@pytest.mark.oracle
 def test_responses_and_controllability_are_reported_for_each_readout(tmp_path: Path) -> None:
     timeline = load_timeline(fitted(tmp_path))
     series = extract_series(read_recordings(tmp_path / "recordings"), readouts="halves")

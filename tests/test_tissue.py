@@ -49,6 +49,7 @@ def assert_same_spikes(one: Spikes, other: Spikes) -> None:
     np.testing.assert_array_equal(one.neuron, other.neuron)
 
 
+@pytest.mark.oracle
 def test_a_second_in_eighty_pieces_is_the_same_bit_for_bit() -> None:
     whole, cut = Tissue(7), Tissue(7)
     x_um, y_um = np.array([500.0, 1500.0, 2500.0]), np.array([400.0, 1200.0, 1800.0])
@@ -317,6 +318,7 @@ def spike(tissue: Tissue, neuron: int) -> None:
     assert neuron in tissue.advance(0.0002).neuron
 
 
+@pytest.mark.oracle
 def test_resting_is_advancing_without_being_watched() -> None:
     watched, rested = Tissue(3, SMALL), Tissue(3, SMALL)
     pulse = Pulse(0.2999, np.array([700.0]), np.array([500.0]))  # its axonal spikes are under way

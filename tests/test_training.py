@@ -93,6 +93,7 @@ def test_the_same_seed_gives_the_same_bits_in_workers_and_on_an_executor_which_s
         np.testing.assert_array_equal(policy.weights[0], alone[name].weights[0])
 
 
+@pytest.mark.oracle
 def test_informative_entries_change_no_policy_and_no_folder(tmp_path: Path) -> None:
     short = replace(SHORT, policies=1, iterations=500)
     named = trained(short, timeline_of(), tmp_path / "named", sources=["a.nwb"], random_return=-12.5)
@@ -318,6 +319,7 @@ def test_shadowing_uses_the_newest_simulator_of_each_minute(tmp_path: Path) -> N
     assert set(held.values()) == {shadowed[0.0,]}
 
 
+@pytest.mark.oracle
 def test_held_percentiles_train_another_policy(tmp_path: Path) -> None:
     moving = weights_after(SHORT, timeline_of(), tmp_path / "checkpoint")
     assert weights_after(replace(SHORT, percentiles="first"), timeline_of(), tmp_path / "checkpoint") != moving
@@ -374,6 +376,7 @@ def test_groups_are_even_and_depend_on_the_number_of_policies_only() -> None:
         assert len(on_two_cores) == max(len(groups), min(2, n))
 
 
+@pytest.mark.oracle
 def test_the_error_of_a_worker_comes_in_one_line(tmp_path: Path) -> None:
     short = replace(SHORT, iterations=1_000, policies=1)
     (tmp_path / ".unfinished").mkdir()

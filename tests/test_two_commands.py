@@ -214,6 +214,7 @@ def baseline() -> dict[str, Policy]:
     return train(Training(Wheels(episode_limit=8), None, policies=2, iterations=480, algorithm=SMALL), None, None)
 
 
+@pytest.mark.oracle
 def test_without_neurons_both_commands_are_continuous(baseline: dict[str, Policy], tmp_path: Path) -> None:
     REGISTRY._registered["two-wheels"] = Wheels
     baseline["p0"].save(tmp_path / "p0.safetensors")
@@ -350,6 +351,7 @@ def test_the_file_of_the_page_runs_as_it_stands(tmp_path: Path) -> None:
     assert "two-wheels, 9-thresholds" in ran.stdout and (tmp_path / "replayed" / "session.nwb").exists()
 
 
+@pytest.mark.oracle
 def test_electrodes_of_readouts_that_no_channel_reads_are_refused_with_their_file(
     recording: Recording, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -666,6 +666,7 @@ def test_figures_of_one_name_are_refused(recorded: Path, tmp_path: Path, capsys:
     assert not list((tmp_path / "figures").glob("*"))
 
 
+@pytest.mark.oracle
 def test_readouts_are_scored_each(recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file, figures = recorded / "recording_0000_min.nwb", tmp_path / "figures"
     assert main(["validate", str(file), "--readouts", "halves", "--out", str(figures), "--json"]) == 0

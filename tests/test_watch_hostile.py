@@ -220,6 +220,7 @@ def test_a_strange_file_costs_no_more_than_its_own_panel(
             assert found["blocks"][0]["title"] == first["title"] and len(found["blocks"]) > 2
 
 
+@pytest.mark.oracle
 @pytest.mark.parametrize("kind", ["pipe", "link"])
 def test_a_pipe_or_a_link_in_place_of_a_file_is_left_out(kind: str, tmp_path: Path) -> None:
     files = ("p0.safetensors", ".unfinished/from-p0.npz", "evaluation.json", "journal.jsonl")

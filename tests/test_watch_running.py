@@ -85,6 +85,7 @@ def test_a_command_that_is_watched_serves_its_folder(tmp_path: Path, capsys: pyt
     end_servers()
 
 
+@pytest.mark.oracle
 def test_a_command_that_is_refused_leaves_no_server(tmp_path: Path) -> None:
     with pytest.raises(InvalidArgument), watching(tmp_path / "none"):
         raise InvalidArgument("--seed: expected another")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import math
+import os
 import shutil
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -24,7 +25,7 @@ from animat.studies.context import ContextStudy, plan_context_study
 from animat.studies.run import plan_study
 from animat.studies.toml import read_study
 from animat.training.policy import CURVE
-from animat.watch.discovery import is_locked
+from animat.watch.discovery import is_locked, recordings_in
 from animat.watch.recording import RecordingView
 from animat.watch.study import CulturesView, StudyView
 from animat.watch.training import TrainingView
@@ -188,6 +189,13 @@ def test_a_study_over_cultures_shows_progress_and_comparisons_so_far(tmp_path: P
     assert block(found, "Running")["rows"] == [[names[3], f"{100 * share:.0f} %"]]
     assert block(found, "Comparisons")["rows"] == [["a and b", "arm", 3.0, 4.0, "2 of 3"]]
     assert view.view(None, 8.0)["state"] == "silent"
+    # A culture that was studied anew has other means.
+    compared = tmp_path / names[2] / "tables" / "comparisons.csv"
+    before = compared.read_text()
+    compared.write_text(before.replace("6.0,5.0", "9.0,11.0"))
+    os.utime(compared, (0, 0))
+    assert block(view.view(None, 8.0), "Comparisons")["rows"] == [["a and b", "arm", 4.0, 6.0, "3 of 3"]]
+    compared.write_text(before)
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
     (tmp_path / "culture-9").symlink_to(elsewhere)
@@ -295,6 +303,20 @@ def test_recordings_are_inspected_one_after_another(tmp_path: Path) -> None:
     np.testing.assert_array_equal(channels, recording.spike_channels[within])
     assert (found["from_s"], found["to_s"]) == (3.0, 5.0)
     assert [row[1] for row in block(found, "Findings")["rows"]] == [each.message for each in inspected[1].findings]
+    # An older one that was replaced is inspected again.
+    os.utime(shutil.copy(files[1], files[0]), (0, 0))
+    replaced = block(view.view(5.0, 2.0), "P(x >= P50) of each condition")["rows"]
+    assert [row[1:] for row in replaced] == [[row[2], row[2]] for row in rows]
+
+
+def test_of_very_many_recordings_the_newest_are_watched(tmp_path: Path) -> None:
+    for n in range(600):
+        (tmp_path / f"recording_{n:04d}_min.nwb").touch()
+        # The last by name is the oldest.
+        os.utime(tmp_path / f"recording_{n:04d}_min.nwb", (1000 - n, 1000 - n))
+    assert [file.name for file in recordings_in(tmp_path)] == [f"recording_{n:04d}_min.nwb" for n in range(500)]
+    complete = facts(RecordingView(tmp_path).view(None, 8.0), "Recordings")["complete"]
+    assert complete == "500 or more: only the newest are watched"
 
 
 def test_a_folder_is_locked_during_a_run(tmp_path: Path) -> None:

@@ -251,6 +251,7 @@ def test_a_neural_observation_is_of_neurons() -> None:
         replace(SEEING, neural_observation="yes")  # type: ignore[arg-type]
 
 
+@pytest.mark.oracle
 def test_a_file_that_is_wrong_about_what_its_policy_sees_is_refused(seeing: Policy, tmp_path: Path) -> None:
     seeing.save(tmp_path / "p0.safetensors")
     whole = (tmp_path / "p0.safetensors").read_bytes()
@@ -280,6 +281,7 @@ def test_commands_beyond_the_bounds_are_refused(commands: tuple[float, ...]) -> 
         WithoutNeurons(Cartpole(), commands)
 
 
+@pytest.mark.oracle
 def test_what_an_environment_is_made_of_is_checked() -> None:
     # Elsewhere, as the tests check types before it can.
     program = """

@@ -60,6 +60,13 @@ class Receipt:
             raise InvalidFile(f"{path}: expected a job's receipt, got a file that cannot be read; remove it") from error
 
 
+def remove_changed(folder: Path, receipts: Path, job: str) -> None:
+    """Delete the files of a job that changed after it: they may be valid, and nothing later would notice the change."""
+    receipt = Receipt.load(receipts, job)
+    for name in () if receipt is None else receipt.changed(folder):
+        (folder / name).unlink(missing_ok=True)
+
+
 def receipt_path(receipts: Path, job: str) -> Path:
     # No job's name has a "+", so two jobs never share a path.
     return receipts / f"{job.replace('/', '+')}.json"

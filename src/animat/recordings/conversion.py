@@ -121,9 +121,7 @@ def convert_recording(
         InvalidArgument: for a choice that the format does not offer, or an `out` that exists or does not end in .nwb.
     """
     path, out = Path(path), Path(out)
-    if out.exists():
-        # It may be the recording itself or its stimuli, and is someone's work in any case.
-        raise InvalidArgument(f"--out: expected a new file, got {out}, which exists; choose another name")
+    _expect_new(out)
     if out.suffix != ".nwb":
         raise InvalidArgument(f"--out: expected a name ending in .nwb, as NWB is written, got {out}")
     if reader is not None and (stimuli is not None or part is not None):
@@ -152,8 +150,16 @@ def convert_recording(
         findings += (Finding("zone-unknown", "note", message),)
     recording = replace(recording, provenance=provenance, start_min=float(start_min), findings=findings, **read)
     clear_leftovers(out.parent, glob.escape(out.name))
+    # Another program may have written it in the meantime.
+    _expect_new(out)
     write_nwb(recording, out)
     return recording
+
+
+def _expect_new(out: Path) -> None:
+    if out.exists():
+        # It may be the recording itself or its stimuli, and is someone's work in any case.
+        raise InvalidArgument(f"--out: expected a new file, got {out}, which exists; choose another name")
 
 
 def _lengths_s(age: str) -> list[float]:

@@ -20,6 +20,7 @@ from animat.cultures.virtual import VirtualCulture
 from animat.errors import AnimatError, InvalidArgument
 from animat.evaluation.table import evaluate
 from animat.execution.jobs import Job, expect_workers
+from animat.execution.receipts import remove_changed
 from animat.execution.task import UNFINISHED, Task
 from animat.execution.training_task import train_alone
 from animat.folders import with_fingerprint
@@ -118,6 +119,7 @@ class RecordCulture(ContextTask):
     n_commands: int = 1
 
     def run(self, folder: Path, progress: Progress) -> list[Path]:
+        remove_changed(folder, folder / RECEIPTS, _record_job(self.culture, self.n_commands))
         out, stimuli = self.recordings(folder, self.n_commands), protocol_for(self.n_commands)
         series = record_series(lambda: VirtualCulture(self.culture), stimuli, out, sessions=2, progress=progress)
         return [*series.files, out / STATE_FILE, out / SELECTION_FILE]
@@ -263,7 +265,7 @@ def plan_context_study(study: ContextStudy) -> list[Job]:
     jobs = []
     commands = {robot: robot_named(robot).n_commands for robot in study.robots}
     for culture in study.cultures:
-        records = {n: f"record/{culture}" + (f"/{n}-commands" if n > 1 else "") for n in sorted({*commands.values()})}
+        records = {n: _record_job(culture, n) for n in sorted({*commands.values()})}
         jobs += [Job(name, RecordCulture(study, culture, n), (), 60) for n, name in records.items()]
         for robot, n in commands.items():
             trained = f"train/{culture}/{robot}"
@@ -273,6 +275,10 @@ def plan_context_study(study: ContextStudy) -> list[Job]:
                 Job(f"measure/{culture}/{robot}", Measure(study, culture, robot), (trained,), 100),
             ]
     return jobs
+
+
+def _record_job(culture: int, n_commands: int) -> str:
+    return f"record/{culture}" + (f"/{n_commands}-commands" if n_commands > 1 else "")
 
 
 def _row(culture: int, robot: str, evaluation: dict[str, Any], session: dict[str, Any]) -> ContextRow:

@@ -10,7 +10,7 @@ from animat.cultures.series import SELECTION_FILE, STATE_FILE, record_series
 from animat.cultures.virtual import VirtualCulture
 from animat.errors import InvalidFile, UnusableData
 from animat.evaluation.transfer import no_memory
-from animat.execution.receipts import Receipt
+from animat.execution.receipts import remove_changed
 from animat.neurons.fidelity import Fidelity
 from animat.neurons.timeline import SimulatorTimeline, fit_timeline, save_timeline
 from animat.progress import Progress
@@ -41,11 +41,8 @@ class MakeRecordings(StudyTask):
         return self.study.culture.kind == "files"
 
     def make(self, folder: Path, progress: Progress) -> list[Path]:
-        out, receipt = folder / RECORDINGS, Receipt.load(folder / RECEIPTS, JOB)
-        # Changed recordings are deleted here, as they may be valid and nothing later would notice the change.
-        for name in () if receipt is None else receipt.changed(folder):
-            (folder / name).unlink(missing_ok=True)
-        culture = self.study.culture
+        remove_changed(folder, folder / RECEIPTS, JOB)
+        out, culture = folder / RECORDINGS, self.study.culture
         if culture.kind == "files":
             return self._copies(out, progress)
         series = record_series(

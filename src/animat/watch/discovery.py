@@ -19,7 +19,8 @@ from animat.writing import LOCK
 
 _MARKS = {kind: names[0] for kind, names in MARKERS.items() if kind not in ("recording", "live")}
 """The file that identifies each kind."""
-_DEPTH, _MOST_FOLDERS, _MOST_ITEMS, _MOST_RECORDINGS = 6, 4000, 2000, 500
+_DEPTH, _MOST_FOLDERS, _MOST_ITEMS = 6, 4000, 2000
+MOST_RECORDINGS = 500
 _SKIPPED = ("jobs", "figures", "tables", "checkpoints")
 """Folders in an item's own, in which there is nothing to watch."""
 _LOCKS = Path("/proc/locks")
@@ -84,13 +85,18 @@ def _in_folder(root: Path, folder: Path) -> Iterator[Item]:
 
 
 def recordings_in(folder: Path) -> dict[Path, float]:
-    """The NWB recordings in a folder, and the one in progress, with when each last changed; none of a session."""
+    """The NWB recordings in a folder, and the one in progress, with when each last changed; none of a session.
+
+    At most `MOST_RECORDINGS`, the newest.
+    """
     try:
         if (folder / LOG_FILE).exists():
             return {}
-        files = [*sorted(folder.glob("[!.]*.nwb"))[:_MOST_RECORDINGS], folder / UNDER_WAY]
-        times_s = {file: changed_s(file) for file in files if file.is_file() and not file.is_symlink()}
-        return {file: time_s for file, time_s in times_s.items() if time_s is not None}
+        files = [*sorted(folder.glob("[!.]*.nwb")), folder / UNDER_WAY]
+        found = [(file, changed_s(file)) for file in files if file.is_file() and not file.is_symlink()]
+        times_s = {file: time_s for file, time_s in found if time_s is not None}
+        newest = set(sorted(times_s, key=times_s.__getitem__, reverse=True)[:MOST_RECORDINGS])
+        return {file: time_s for file, time_s in times_s.items() if file in newest}
     except OSError:
         return {}
 

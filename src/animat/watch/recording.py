@@ -15,7 +15,7 @@ from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
 from animat.report.array import rates_of_sites
 from animat.responses.inspection import Inspection, inspect_recording
-from animat.watch.discovery import is_locked, recordings_in
+from animat.watch.discovery import MOST_RECORDINGS, is_locked, recordings_in
 from animat.watch.files import packed, text
 from animat.watch.view import View, chart, curve, facts, in_blocks, table
 
@@ -34,7 +34,8 @@ class RecordingView(View):
         super().__init__(folder)
         self._key: tuple[Path, float] | None = None
         self._content: _Content = None, None, ""
-        self._shares: dict[Path, _Shares] = {}
+        self._shares: dict[Path, tuple[float, _Shares]] = {}
+        """When each file last changed, and its shares."""
 
     def _title(self) -> str:
         return "recordings"
@@ -54,7 +55,10 @@ class RecordingView(View):
         if recording is not None:
             raster, span = _raster(recording, to_s, span_s)
             blocks += [raster, _rates(recording)]
-        blocks += [_shares_table(self._shares, len(times_s)), *_inspected(inspection)]
+        blocks += [
+            _shares_table([shares for _, shares in self._shares.values()], len(times_s)),
+            *_inspected(inspection),
+        ]
         state, message = "ended", counted(n_whole, "recording")
         if running is False and in_progress:
             state = "silent"
@@ -72,18 +76,19 @@ class RecordingView(View):
 
     def _newest_inspection(self, times_s: dict[Path, float], newest: Path) -> _Content:
         """The newest, read again if it changed; else one of the others is inspected, as each takes a second or two."""
-        self._shares = {file: row for file, row in self._shares.items() if file in times_s}
+        self._shares = {file: each for file, each in self._shares.items() if times_s.get(file) == each[0]}
         if self._key != (newest, times_s[newest]):
             self._key, self._content = (newest, times_s[newest]), _read(newest)
-            self._shares[newest] = _shares_of(self._content[1])
+            self._shares[newest] = times_s[newest], _shares_of(self._content[1])
         elif (other := next((file for file in times_s if file not in self._shares), None)) is not None:
-            self._shares[other] = _shares_of(_read(other)[1])
+            self._shares[other] = times_s[other], _shares_of(_read(other)[1])
         return self._content
 
 
 def _facts(inspection: Inspection | None, n_whole: int, newest: Path) -> list[tuple[str, Any]]:
     shown = "the one in progress, as far as it has come" if newest.name == UNDER_WAY else newest.name
-    rows: list[tuple[str, Any]] = [("complete", n_whole), ("shown", shown)]
+    complete = n_whole if n_whole < MOST_RECORDINGS - 1 else f"{n_whole} or more: only the newest are watched"
+    rows: list[tuple[str, Any]] = [("complete", complete), ("shown", shown)]
     if inspection is not None:
         rows += [
             ("verdict", inspection.verdict),
@@ -139,9 +144,9 @@ def _rates(recording: Recording) -> dict[str, Any]:
     return chart("Rates of channels", "channels, by rate", "Hz", [line], note, width="half")
 
 
-def _shares_table(shares: dict[Path, _Shares], files: int) -> dict[str, Any]:
+def _shares_table(shares: list[_Shares], files: int) -> dict[str, Any]:
     """The share of responses above the median for each condition, in each recording inspected so far."""
-    columns = sorted(((minute, column) for minute, column in shares.values() if column), key=lambda pair: pair[0])
+    columns = sorted(((minute, column) for minute, column in shares if column), key=lambda pair: pair[0])
     labels = list(dict.fromkeys(label for _, column in columns for label in column))
     rows = [[label, *(f"{of[label]:.2f}" if label in of else None for _, of in columns)] for label in labels]
     note = (

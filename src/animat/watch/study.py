@@ -137,7 +137,8 @@ class CulturesView(View):
 
     def __init__(self, folder: Path) -> None:
         super().__init__(folder)
-        self._compared: dict[str, _Means] = {}
+        self._compared: dict[str, tuple[float | None, _Means]] = {}
+        """When each culture's table last changed, and its means."""
 
     def _title(self) -> str:
         return f"study over {len(self._names()):,} cultures"
@@ -172,9 +173,13 @@ class CulturesView(View):
 
     def _comparisons(self, done: list[str], width: Width) -> dict[str, Any]:
         for name in done:
-            if name not in self._compared and (means := _means_of(self.folder / name / _COMPARISONS)) is not None:
-                self._compared[name] = means
-        known = [self._compared[name] for name in done if name in self._compared]
+            file = self.folder / name / _COMPARISONS
+            if (time_s := changed_s(file)) == self._compared.get(name, (None,))[0]:
+                continue
+            self._compared.pop(name, None)
+            if (means := _means_of(file)) is not None:
+                self._compared[name] = time_s, means
+        known = [self._compared[name][1] for name in done if name in self._compared]
         rows = []
         for comparison in dict.fromkeys(key for means in known for key in means):
             pairs = [means[comparison] for means in known if comparison in means]
