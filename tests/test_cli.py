@@ -1075,7 +1075,8 @@ def test_a_terminal_without_utf_8_gets_question_marks(monkeypatch: pytest.Monkey
         assert line in written.getvalue().decode("ascii")
 
 
-@pytest.mark.parametrize("arguments", [["live", "--help"], pytest.param(["--version"], marks=pytest.mark.oracle)])
+@pytest.mark.oracle
+@pytest.mark.parametrize("arguments", [["live", "--help"], ["--version"]])
 def test_a_reader_that_closes_early_is_no_error(arguments: list[str]) -> None:
     read, write = os.pipe()
     os.close(read)
@@ -1084,7 +1085,8 @@ def test_a_reader_that_closes_early_is_no_error(arguments: list[str]) -> None:
     assert (done.returncode, done.stderr) == (141, "")
 
 
-@pytest.mark.parametrize("arguments", [["live", "--help"], pytest.param(["--version"], marks=pytest.mark.oracle)])
+@pytest.mark.oracle
+@pytest.mark.parametrize("arguments", [["live", "--help"], ["--version"]])
 def test_output_that_is_closed_is_no_error_and_a_full_disk_is_reported_in_a_line(arguments: list[str]) -> None:
     closed = subprocess.run(
         ["sh", "-c", 'exec "$@" >&-', "sh", sys.executable, "-m", "animat", *arguments], capture_output=True, text=True
@@ -1100,6 +1102,7 @@ def test_output_that_is_closed_is_no_error_and_a_full_disk_is_reported_in_a_line
     assert (done.returncode, done.stderr) == (1, message)
 
 
+@pytest.mark.oracle
 @pytest.mark.parametrize("is_disk", [True, False])
 def test_a_log_on_a_full_disk_or_that_nobody_reads_ends_no_command(is_disk: bool) -> None:
     if is_disk and not Path("/dev/full").exists():

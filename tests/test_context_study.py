@@ -68,6 +68,7 @@ def test_what_holds_is_counted_over_cultures() -> None:
     assert some == needs.replace("0.70).", "0.70); on 1 more this is not known.")
 
 
+@pytest.mark.oracle
 def test_the_page_has_every_number_and_shares_of_what_is_over_random(tmp_path: Path) -> None:
     study = ContextStudy(cultures=(1, 2), robots=("shuttle", "cartpole"))
     lost = tuple(LostRow(c, r, "silent", 20.0, 60.0, 50.0, 70.0) for c in (1, 2) for r in study.robots)

@@ -308,6 +308,10 @@ def test_where_no_agent_is_above_random_stimuli_or_the_coupling_nothing_is_known
     couplings, random, known = (rng.normal(mean, 1, 50) for mean in (0.0, -80.0, -85.0))
     below_random = least_context_gap(couplings, random, known[None])
     assert below_random.gap is None and "the best known agent (-8" in below_random.to_text()
+    # Of two episodes the best known agent is measured in the second: one.
+    in_two = least_context_gap(couplings[:2], random[:2], np.array([[30.0, 31.0], [29.0, 33.0]]))
+    assert in_two.gap is None
+    assert in_two.to_text().endswith("no context gap, as the best known agent (31.0) was measured in one episode")
     below_coupling = least_context_gap(couplings, random, known[None] + 60)
     assert below_coupling.gap is not None and below_coupling.gap.value == 0 and not below_coupling.needs_context
     assert below_coupling.to_text().endswith("whether this task needs more than a reflex is not known")

@@ -140,6 +140,7 @@ def test_a_recording_is_what_the_tissue_does_on_its_own() -> None:
         assert culture.now_s == pytest.approx(schedule.duration_s)
 
 
+@pytest.mark.oracle
 @pytest.mark.parametrize("piece_s", [0.0125, 0.00007, 0.3])
 def test_the_same_spikes_however_time_is_cut(piece_s: float) -> None:
     whole, cut = small_culture().open(), small_culture().open()

@@ -56,6 +56,7 @@ def same(files: list[Path], others: list[Path]) -> bool:
     )
 
 
+@pytest.mark.oracle
 def test_the_orders_of_stimuli_are_of_the_culture_s_own_seed(undisturbed: list[Path], tmp_path: Path) -> None:
     files = [*undisturbed[:2], *record(tmp_path, sessions=1, seed=2)]
     assert [read_recording(file).provenance["protocol_seed"] for file in files] == ["10000", "10001", "20000"]

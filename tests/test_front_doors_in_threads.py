@@ -210,9 +210,8 @@ def crowd_at(
     assert crowd.refused_as_too_soon > too_soon
 
 
-@pytest.mark.parametrize(
-    "kind", ["virtual", "maxone", *(pytest.param(kind, marks=pytest.mark.oracle) for kind in ("replay", "cl1"))]
-)
+@pytest.mark.oracle
+@pytest.mark.parametrize("kind", ["virtual", "maxone", "replay", "cl1"])
 def test_from_several_threads_nothing_outside_the_limits_is_delivered(kind: str, patch: pytest.MonkeyPatch) -> None:
     crowd_at(kind, 2_500, 5, 1, 300, patch, too_soon=50)
 

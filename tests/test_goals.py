@@ -218,6 +218,7 @@ class Walker(Robot[Walk]):
         return jnp.stack([state.at])
 
 
+@pytest.mark.oracle
 @pytest.mark.parametrize(
     ("goal", "away"),
     [
@@ -336,31 +337,24 @@ def test_a_goal_with_within_has_no_grid_and_says_so() -> None:
         best_return(WithoutNeurons(robot, (-1.0, 1.0)), None, episodes=0)
 
 
+@pytest.mark.oracle
 @pytest.mark.parametrize(
     ("goal", "beyond"),
     [
         (CARTPOLE, ""),
-        pytest.param(
-            "avoid pole_angle outside -10..10 deg; avoid cart_position outside -0.4..0.4 m",
-            "",
-            marks=pytest.mark.oracle,
-        ),
+        ("avoid pole_angle outside -10..10 deg; avoid cart_position outside -0.4..0.4 m", ""),
         ("avoid pole_angle outside -12..12 deg", ""),
         # What is but a little beyond makes no difference.
         ("avoid pole_angle outside -0.21..0.21 rad; avoid cart_position outside -0.505..0.505 m", ""),
         ("avoid pole_angle outside -13..13 deg", "pole_angle beyond -0.209 to 0.209 rad"),
-        pytest.param(f"{CARTPOLE}; drive cart_position in 0.1..0.3 m", "", marks=pytest.mark.oracle),
+        (f"{CARTPOLE}; drive cart_position in 0.1..0.3 m", ""),
         (
             "avoid pole_angle outside -12..12 deg; drive cart_position above 0.55 m",
             "cart_position beyond -0.5 to 0.5 m",
         ),
-        pytest.param(
-            "drive cart_position above 0.55 m", "cart_position beyond -0.5 to 0.5 m", marks=pytest.mark.oracle
-        ),
+        ("drive cart_position above 0.55 m", "cart_position beyond -0.5 to 0.5 m"),
         ("drive pole_angle in -12..12 deg", "pole_angle beyond -0.209 to 0.209 rad"),
-        pytest.param(
-            "avoid pole_angle outside -90..90 deg", "pole_angle beyond -0.209 to 0.209 rad", marks=pytest.mark.oracle
-        ),
+        ("avoid pole_angle outside -90..90 deg", "pole_angle beyond -0.209 to 0.209 rad"),
         ("avoid cart_position outside -0.5..0.5 m", "pole_angle beyond -0.209 to 0.209 rad"),
     ],
 )

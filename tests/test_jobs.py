@@ -310,7 +310,8 @@ def test_a_recording_s_digest_rests_on_all_of_it_and_on_no_version_of_numpy(monk
     assert len(written) == 12 and all(isinstance(array, np.ndarray) for array in written.values())
 
 
-@pytest.mark.parametrize("freezes", [False, pytest.param(True, marks=pytest.mark.oracle)])
+@pytest.mark.oracle
+@pytest.mark.parametrize("freezes", [False, True])
 def test_a_task_at_work_elsewhere_is_waited_for_unless_it_is_frozen(
     freezes: bool, ours: Executor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -44,13 +44,13 @@ from animat.responses.quality.history import compare_passing, memory_findings
 from animat.responses.responses import Responses, Trials
 from animat.robots.cartpole import Cartpole
 from animat.robots.navigation import Navigation
-from animat.stimulation.protocol import Presentation
+from animat.stimulation.protocol import Presentation, Protocol
 from animat.studies.differences import decisions
 from animat.studies.paper import paper_study
 from animat.studies.specification import Simulators
 from animat.training.specification import Training
 from animat.wrappers import ShuffledDelivery
-from synthetic_recordings import synthetic_recording
+from synthetic_recordings import SyntheticCulture, synthetic_recording
 from test_optimum import STEPS, Stairs, coins
 from test_responses import recording
 from test_simulator import responses_of
@@ -640,7 +640,8 @@ def persistent(n: int = 10) -> MemorySimulator:
     )
 
 
-@pytest.mark.parametrize("limit", [2, *(pytest.param(limit, marks=pytest.mark.oracle) for limit in (1, 5, 60))])
+@pytest.mark.oracle
+@pytest.mark.parametrize("limit", [2, 1, 5, 60])
 def test_the_optimum_knows_what_the_neurons_remember(limit: int) -> None:
     """Up and down stairs with a coin that remembers, folded back by hand over step and last toss."""
     heads = np.array([[0.2, 0.5], [0.5, 0.8]])  # after tails and heads, of each action
@@ -737,9 +738,7 @@ def test_the_optimum_of_a_custom_simulator_with_memory_is_refused() -> None:
         best_return(Animat(Stairs(), Thresholds(1), 5), own, grid=STEPS, episodes=0)
 
 
-@pytest.mark.parametrize(
-    "mapping", [Thresholds(1), *(pytest.param(other, marks=pytest.mark.oracle) for other in (Thresholds(9), Linear()))]
-)
+@pytest.mark.parametrize("mapping", [Thresholds(1), Thresholds(9), Linear()])
 @pytest.mark.oracle
 def test_where_nothing_is_remembered_commands_and_optimum_are_those_without_memory(mapping: Any) -> None:
     responses = independent(0)
@@ -864,6 +863,20 @@ def test_a_memory_of_blocks_is_reported() -> None:
         found = {finding.name for finding in fit_timeline([responses], kind="memory").findings}
         assert ("memory-of-blocks" in found) == (order == "blocked")
         assert "memory-of-blocks" not in {finding.name for finding in fit_timeline([responses]).findings}
+
+
+def test_the_load_decays_while_stimulation_is_set_up_between_blocks() -> None:
+    recording = SyntheticCulture(1, channels=32, patterns=20).record(0)
+    protocol = Protocol(patterns=20, trials=20, setup_s=14.0)
+    presented = extract_responses(replace(recording, protocol=protocol), burst_threshold=0.95).presentations[0]
+    at_once = extract_responses(recording, burst_threshold=0.95).presentations[0]
+    assert presented.clock_s is not None and presented.time_s is not None and at_once.clock_s is at_once.time_s
+    is_first = np.arange(100) % 20 == 0
+    waited_s = np.diff(presented.clock_s) - np.diff(presented.time_s)
+    np.testing.assert_allclose(waited_s, np.where(is_first[1:], 14.0, 0.0), atol=1e-9)
+    responses = extract_responses(replace(recording, protocol=protocol), burst_threshold=0.95)
+    loads = Ranked(responses).loads(1.0).every
+    assert np.all(loads[is_first] < 1e-5) and np.all(loads[~is_first] > 1e-3)
 
 
 def test_the_fidelity_of_a_simulator_with_memory_is_that_of_its_answers() -> None:

@@ -148,6 +148,7 @@ def test_recordings_of_two_real_cultures_are_not_one_series(
     assert inspected["together"][0]["value"] is None
 
 
+@pytest.mark.oracle
 @pytest.mark.parametrize(
     "start_min, frequencies_hz, words",
     [

@@ -261,11 +261,10 @@ def test_an_agent_runs_beside_policies_with_its_own_prediction(tmp_path: Path, m
     error = np.hypot(like.std() / len(like) ** 0.5, p1.std() / len(p1) ** 0.5)
     assert abs(like.mean() - p1.mean()) < 4 * error + 1e-9
     assert rows["like p1"].comparison is not None and "your own agent" in gap.to_text()
-    with (
-        FakeCulture() as culture,
-        pytest.raises(InvalidArgument, match=r"agents: expected names other than .*, got p0"),
-    ):
-        run_policies(policies, culture, Calibration.of_series(series), tmp_path / "b", agents={"p0": Wrong(0)})
+    for name in ("p0", "policies", "coupling", "silent"):
+        message = f"agents: expected names other than .*, got {name}"
+        with FakeCulture() as culture, pytest.raises(InvalidArgument, match=message):
+            run_policies(policies, culture, Calibration.of_series(series), tmp_path / "b", agents={name: Wrong(0)})
     for name, meant in {"controls": r"; did you mean with_controls\?", "robot": "", "adaptive": ""}.items():
         message = f"{name}: expected an argument of run_policies, or .*, got neither{meant}$"
         with FakeCulture() as culture, pytest.raises(InvalidArgument, match=message):
@@ -399,15 +398,14 @@ def test_ctrl_c_is_not_held_until_the_last_episode(is_on_host: bool, in_the_fore
     assert asked < 200
 
 
+@pytest.mark.oracle
 @pytest.mark.parametrize(
     ("agent", "message"),
     [
         (Always(-1), "agents: mine: act: expected the index of .* from 0 to 4, got -1"),
-        pytest.param(
-            Always(9), "agents: mine: act: expected the index of .* from 0 to 4, got 9", marks=pytest.mark.oracle
-        ),
+        (Always(9), "agents: mine: act: expected the index of .* from 0 to 4, got 9"),
         (Always(1.0), "agents: mine: expected it to act in JAX, got TypeError: act: expected a whole number for each"),
-        pytest.param(Misshaped(), "agents: mine: expected it to act in JAX, got", marks=pytest.mark.oracle),
+        (Misshaped(), "agents: mine: expected it to act in JAX, got"),
     ],
 )
 def test_on_a_robot_outside_jax_an_agent_in_jax_is_tried_too(agent: Actor, message: str) -> None:

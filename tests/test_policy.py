@@ -109,6 +109,7 @@ def test_numpy_answers_as_jax_does(seed: int) -> None:
     np.testing.assert_allclose(policy.outputs(observation.astype(np.float64)), exact, rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.oracle
 def test_actions_are_drawn_as_often_as_their_probabilities_say() -> None:
     policy, rng = through_neurons(), np.random.default_rng(4)
     policy = replace(policy, weights=tuple(0.3 * w for w in policy.weights))

@@ -164,7 +164,8 @@ def test_a_folder_with_a_session_is_refused_before_anything_is_predicted(
         run(tmp_path, series)
 
 
-@pytest.mark.parametrize("greedy", [True, pytest.param(False, marks=pytest.mark.oracle)])
+@pytest.mark.oracle
+@pytest.mark.parametrize("greedy", [True, False])
 def test_policies_are_greedy_or_draw_in_prediction_and_loop_alike(
     greedy: bool, tmp_path: Path, series: list[Responses], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -295,6 +296,7 @@ def test_with_few_responses_to_a_condition_there_is_no_optimal_return(
     assert message in gap.to_text() and "optimal return on this" not in gap.to_text()
 
 
+@pytest.mark.oracle
 @pytest.mark.usefixtures("few_bootstraps")
 def test_the_optimal_return_is_computed_before_the_session_and_so_known_where_the_budget_ends_it(
     tmp_path: Path, series: list[Responses], calibration: Calibration, monkeypatch: pytest.MonkeyPatch
@@ -773,12 +775,15 @@ WEAK = Pulse((Phase(400.0, amplitude_mv=-90.0), Phase(400.0, amplitude_mv=90.0))
 CURRENT = Pulse((Phase(160.0, amplitude_ua=-1.0), Phase(160.0, amplitude_ua=1.0)))
 
 
+@pytest.mark.oracle
 @pytest.mark.usefixtures("few_bootstraps")
 @pytest.mark.parametrize(
     "case",
     [
         *("recorded", "given", "replay of current"),
-        *(pytest.param(case, marks=pytest.mark.oracle) for case in ("unknown", "session", "replay")),
+        "unknown",
+        "session",
+        "replay",
     ],
 )
 def test_a_loop_delivers_what_its_recording_was_made_with(
@@ -1079,8 +1084,9 @@ def test_the_percentiles_are_those_of_the_last_simulator_in_training(series: lis
     )
 
 
+@pytest.mark.oracle
 @pytest.mark.usefixtures("few_bootstraps")
-@pytest.mark.parametrize(("rest_min", "warned"), [pytest.param(20.0, False, marks=pytest.mark.oracle), (45.0, True)])
+@pytest.mark.parametrize(("rest_min", "warned"), [(20.0, False), (45.0, True)])
 def test_a_recording_much_older_than_the_culture_is_reported(
     tmp_path: Path, series: list[Responses], calibration: Calibration, rest_min: float, warned: bool
 ) -> None:
@@ -1120,6 +1126,7 @@ def test_on_a_device_whose_clock_started_anew_a_recordings_date_tells_its_age(
     assert any("from a recording made 26 h before this session: cultures drift" in line for line in lines)
 
 
+@pytest.mark.oracle
 @pytest.mark.usefixtures("few_bootstraps")
 def test_policies_that_do_not_belong_together_are_refused(
     tmp_path: Path, series: list[Responses], calibration: Calibration
@@ -1192,6 +1199,7 @@ class TestCommand:
         assert json.loads(capsys.readouterr().out.splitlines()[-1])["ticks"] == data["session"]["ticks"]
         assert main(["inspect", str(folder / "session" / "session.nwb")]) == 0
 
+    @pytest.mark.oracle
     def test_an_existing_session_is_not_overwritten(self, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert self.command(folder, "--controls", "random") == 0
         before = (folder / "session" / "session.log").read_bytes()

@@ -88,6 +88,7 @@ def long_named(kind: str) -> Figure:
     return draw_headline(rows, narrow=kind == "narrow headline")
 
 
+@pytest.mark.oracle
 @pytest.mark.parametrize(
     "kind", ["comparisons", "learning", "over time", "over cultures", "headline", "narrow headline"]
 )

@@ -547,6 +547,7 @@ def test_every_entry_of_a_series_is_a_stimulus_if_its_data_are_not_one_number_ea
         assert read_hdf5(path).stimuli.time_s.tolist() == [0.1, 0.2, 0.3]
 
 
+@pytest.mark.oracle
 @pytest.mark.parametrize(
     ("of", "times_s"),
     [

@@ -119,6 +119,7 @@ def test_a_jitted_step_draws_no_random_numbers_in_advance(robot: Robot) -> None:
     assert "random" not in traced and "threefry" not in traced
 
 
+@pytest.mark.oracle
 def test_a_batch_steps_as_each_alone(robot: Robot) -> None:
     u = commands_of(robot, jnp.linspace(-1, 1, 7))
     keys = jax.random.split(jax.random.key(3), 7)
@@ -204,6 +205,7 @@ def test_data_of_another_form_are_refused(data: object) -> None:
         robot_from_dict(data)  # type: ignore[arg-type]
 
 
+@pytest.mark.oracle
 @pytest.mark.parametrize(
     "robot",
     [

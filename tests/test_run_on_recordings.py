@@ -82,16 +82,15 @@ def run(out: Path, policy: Policy, recordings: Path, *more: str) -> int:
     return main(["run", str(out.parent / "p0.safetensors"), "--out", str(out), *given, *more])
 
 
+@pytest.mark.oracle
 @pytest.mark.parametrize(
     ("more", "has_state", "words"),
     [
         (["--at-min", "1"], True, ""),
-        pytest.param(["--at-min", "1", "--state", "{state}"], False, "", marks=pytest.mark.oracle),
-        pytest.param(["--at-min", "0"], False, "", marks=pytest.mark.oracle),
+        (["--at-min", "1", "--state", "{state}"], False, ""),
+        (["--at-min", "0"], False, ""),
         (["--at-min", "1"], False, "starts afresh at 0 min, but its percentiles are of the recording at 1 min"),
-        pytest.param(
-            ["--at-min", "1", "--culture-seed", "1"], True, "starts afresh at 0 min", marks=pytest.mark.oracle
-        ),
+        (["--at-min", "1", "--culture-seed", "1"], True, "starts afresh at 0 min"),
         (["--culture-seed", "2"], True, "of virtual culture 1, but this is virtual culture 2"),
     ],
 )
@@ -142,12 +141,13 @@ OTHERS, WEAK = " as in the other recordings", Pulse((Phase(200, amplitude_mv=-10
 USUAL = " the usual one with --culture virtual"
 
 
+@pytest.mark.oracle
 @pytest.mark.parametrize(
     ("pulses", "file", "delivered", "warned"),
     [
         ((WEAK, WEAK), None, WEAK, ""),
-        pytest.param((BALANCED_PULSE, None), None, BALANCED_PULSE, OTHERS, marks=pytest.mark.oracle),
-        pytest.param((None, None), None, PUBLISHED_PULSE, USUAL, marks=pytest.mark.oracle),
+        ((BALANCED_PULSE, None), None, BALANCED_PULSE, OTHERS),
+        ((None, None), None, PUBLISHED_PULSE, USUAL),
         ((None, None), WEAK, WEAK, ""),
     ],
 )
@@ -237,12 +237,13 @@ def test_a_pulse_that_the_culture_may_not_be_given_is_refused_before_it_is_opene
     assert not (tmp_path / "session").exists()
 
 
+@pytest.mark.oracle
 @pytest.mark.parametrize(
     "frequencies_hz",
     [
-        pytest.param((5.0, 80.0), marks=pytest.mark.oracle),
+        (5.0, 80.0),
         (80.0, 5.0),
-        pytest.param((80.0, 40.0, 20.0, 10.0, 5.0), marks=pytest.mark.oracle),
+        (80.0, 40.0, 20.0, 10.0, 5.0),
     ],
 )
 def test_policies_on_some_of_the_frequencies_are_calibrated_by_those(
@@ -275,6 +276,7 @@ def test_policies_on_some_of_the_frequencies_are_calibrated_by_those(
     assert {tick.frequency_hz for tick in ticks} <= set(frequencies_hz)
 
 
+@pytest.mark.oracle
 @pytest.mark.parametrize(
     ("trained", "asked", "kind", "numbers"),
     [

@@ -48,6 +48,7 @@ def test_it_is_the_synthetic_culture_without_fatigue() -> None:
         ({"means_hz": (30.0, -1.0)}, "means_hz"),
         ({"means_hz": (30.0, float("nan"))}, "means_hz"),
         ({"shape": 0.0}, "shape"),
+        ({"shape": 0.05}, "shape"),
     ],
 )
 def test_settings_without_meaning_are_refused(settings: dict, name: str) -> None:

@@ -495,9 +495,8 @@ def check_by_hand(responses: Responses, readout: int | None = None) -> Validatio
     return found
 
 
-@pytest.mark.parametrize(
-    ("window_ms", "drift"), [((2.0, 10.0), 0.0), pytest.param((3.0, 18.0), -0.1, marks=pytest.mark.oracle)]
-)
+@pytest.mark.oracle
+@pytest.mark.parametrize(("window_ms", "drift"), [((2.0, 10.0), 0.0), ((3.0, 18.0), -0.1)])
 def test_the_organoid_by_hand(real_data: Path, window_ms: tuple[float, float], drift: float) -> None:
     recording = read_recording(real_data / "organoid_cartpole_maxone.npz")
     found = check_by_hand(extract_responses(recording, conditions_named("interval:5,10+-25%"), window_ms))
@@ -619,10 +618,11 @@ def test_the_figure_names_its_axes(known: Validation) -> None:
     assert all(len(line) <= 120 for line in text.splitlines()[1:])
 
 
+@pytest.mark.oracle
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param("known.npz", marks=pytest.mark.oracle),
+        "known.npz",
         "cost$_{a$.npz",
         "culture 12, day 42 in vitro, mixed, by the second operator, again.nwb",
     ],

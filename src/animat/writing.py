@@ -93,9 +93,19 @@ def exclusive_lock(folder: str | os.PathLike[str]) -> Iterator[None]:
 
     Raises:
         Mismatch: if another run is using it.
-        InvalidFile: if it cannot be created, or is empty and cannot be written to.
+        InvalidFile: if it cannot be created, is empty and cannot be written to, or was removed during the block.
     """
     folder = Path(folder)
+    with locked(folder) as descriptor:
+        yield
+        if not _is_same(folder, descriptor):
+            lost = "what had been written to it is lost"
+            raise InvalidFile(f"{folder}: it was removed or replaced during the run, and {lost}: run it again")
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[int]:
+    """As `exclusive_lock`, of a folder that may be removed; yields its descriptor."""
     with as_invalid_file(folder, "cannot be created or read", "; choose another --out"):
         created = [each for each in (folder, *folder.parents) if not each.exists()]
         if not folder.is_dir() or not any(folder.iterdir()):
@@ -111,7 +121,7 @@ def exclusive_lock(folder: str | os.PathLike[str]) -> Iterator[None]:
                 descriptors.append(os.open(folder / LOCK, os.O_RDWR | os.O_CREAT, 0o666))
                 take_lock(folder, descriptors[1])
         try:
-            yield
+            yield descriptors[0]
         except BaseException:
             with suppress(OSError):
                 for each in created:
@@ -135,10 +145,14 @@ def take_lock(folder: Path, descriptor: int) -> bool:
 
 def _expect_same(folder: Path, descriptor: int) -> None:
     """Raise if a failed run removed the folder after it was opened and before it was locked."""
-    with suppress(FileNotFoundError):
-        if os.path.samestat(os.fstat(descriptor), folder.stat()):
-            return
-    raise Mismatch(f"{folder}: another run was at work in this folder, and removed it; start again")
+    if not _is_same(folder, descriptor):
+        raise Mismatch(f"{folder}: another run was at work in this folder, and removed it; start again")
+
+
+def _is_same(folder: Path, descriptor: int) -> bool:
+    with suppress(OSError):
+        return os.path.samestat(os.fstat(descriptor), folder.stat())
+    return False
 
 
 def clear_away(leftover: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import operator
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
@@ -28,7 +27,7 @@ from animat.cultures.budget import Account
 from animat.cultures.failures import describe_error
 from animat.cultures.observed import Observed
 from animat.errors import AnimatError, BudgetSpent
-from animat.evaluation.controllers import Controller, begun
+from animat.evaluation.controllers import Controller, begun, index_of
 from animat.neurons.history_tracker import HistoryState
 from animat.responses.extraction import SILENCE_S
 from animat.robots.starts import robot_generator
@@ -168,7 +167,7 @@ class Driver:
 
     def _choose(self, agent: Agent, controller: Controller, seen: Float64[np.ndarray, " observed"]) -> int:
         n = len(self.loop.conditions)
-        chosen = self._ask(agent.name, "controller", lambda: operator.index(controller.act(seen, self._rng)))
+        chosen = self._ask(agent.name, "controller", lambda: index_of(controller.act(seen, self._rng)))
         if not 0 <= chosen < n:
             raise Stop(Ending("controller", f"{agent.name} chose {chosen}: expected a condition from 0 to {n - 1}"))
         return chosen

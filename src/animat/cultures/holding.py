@@ -10,7 +10,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from animat.errors import DeviceFailed, InvalidFile, Mismatch
-from animat.writing import exclusive_lock
+from animat.writing import locked
 
 MACHINE = Path("/tmp")
 """Holds the folders of devices that all programs on this machine share; not `TMPDIR`, which differs by user."""
@@ -35,7 +35,7 @@ def hold(device: Path, holder: str) -> Iterator[bool]:
             # Refused, as the parent is world-writable: another user could have made it a link to one of our folders.
             if device.is_symlink() or (device.exists() and not device.is_dir()):
                 raise DeviceFailed(f"{device.name}: expected a folder as its lock, got another file: remove {device}")
-            stack.enter_context(exclusive_lock(device))
+            stack.enter_context(locked(device))
             if device.stat().st_uid == os.geteuid():
                 # Other users of the machine may hold it later; they cannot remove our files.
                 device.chmod(0o1777)

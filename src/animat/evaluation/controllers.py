@@ -50,11 +50,17 @@ def sees_neurons(controller: Controller) -> bool:
     return bool(getattr(getattr(controller, "policy", controller), "neural_observation", False))
 
 
+def index_of(chosen: Any) -> int:
+    """The chosen index as a plain number; TypeError if it is none, as True, which is no index in numpy either."""
+    if isinstance(chosen, bool):
+        raise TypeError(f"expected the index of a condition, got {chosen}")
+    return operator.index(chosen)
+
+
 def expect_condition(chosen: Any, n: int) -> int:
     """The chosen index as a plain number; InvalidArgument if it is none of n conditions."""
     try:
-        # True is no more the index 1 than it is in numpy.
-        index = -1 if isinstance(chosen, bool) else operator.index(chosen)
+        index = index_of(chosen)
     except TypeError:
         index = -1
     if not 0 <= index < n:

@@ -164,9 +164,10 @@ class ContextGap:
 
     Attributes:
         coupling: mean return of the best coupling.
-        gap: with its interval for episodes and grid; None for one episode, or an optimum not above random stimuli.
+        gap: with its interval for episodes and grid; None for too few episodes, or an optimum not above random stimuli.
         best_known: mean return of the best known agent, which replaces the optimum; None if the optimum is known.
         highest: if it is not, the highest possible return of an episode.
+        random: if it is not, the mean return of random stimuli.
     """
 
     coupling: float
@@ -174,6 +175,7 @@ class ContextGap:
     gap: Interval | None
     best_known: float | None = None
     highest: float = np.inf
+    random: float = np.inf
 
     @property
     def needs_context(self) -> bool:
@@ -227,6 +229,8 @@ class ContextGap:
         if not np.isfinite(self.standard_error):
             return f"{coupling}; no context gap with one episode"
         coupling, known = f"{coupling} +- {self.standard_error:.1f}", self.best_known
+        if self.gap is None and known is not None and known > self.random:
+            return f"{coupling}; no context gap, as the best known agent ({known:.1f}) was measured in one episode"
         if self.gap is None:
             best = "the optimal return" if known is None else f"the best known agent ({known:.1f})"
             return f"{coupling}; no context gap, as {best} is not above that of random stimuli"
@@ -295,4 +299,4 @@ def least_context_gap(
         spread = _Z * float(np.hypot((1 - value) * error, standard_error(value * random - coupling)) / span)
         value, low, high = (float(np.clip(each, 0, 1)) for each in (value, value - spread, value + spread))
         gap = Interval(value, low, high)
-    return ContextGap(means[1], standard_error(coupling), gap, means[0], highest)
+    return ContextGap(means[1], standard_error(coupling), gap, means[0], highest, means[2])

@@ -78,7 +78,7 @@ class WellSampled:
     ) -> Optimum:
         """The optimum in this environment with what was left out, and its interval.
 
-            low = v + min(q, -p) - e,    high = v + p + e,    q, p: the 2.5 and the 97.5 % quantile of v_b - v_0
+            low = v + min(q, -p, 0) - e,    high = v + max(p, 0) + e,    q, p: 2.5 and 97.5 % quantile of v_b - v_0
 
         with v the optimum, v_0 the same on a coarse grid, v_b that of responses bootstrapped, condition by condition,
         39 times, and e the grid's error. The lower end is the lower of those of the percentile and the reversed

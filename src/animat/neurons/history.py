@@ -123,11 +123,11 @@ class Ranked:
     def loads(self, load_s: float) -> Loads:
         """The load before each response."""
         presented = self._presented
-        if not load_s or presented.time_s is None:
+        if not load_s or presented.clock_s is None:
             every = np.full(len(presented.rate_hz), 0.5)
             half = every[self._place]
             return Loads(every, half, half, np.ones(len(self.rows)), 0.0)
-        since_s = np.diff(presented.time_s, prepend=-np.inf)
+        since_s = np.diff(presented.clock_s, prepend=-np.inf)
         left, lefts, loads = 0.0, [], []
         for kept in np.exp(-since_s / load_s).tolist():
             lefts.append(left)

@@ -134,10 +134,10 @@ class AdjustedRanks:
     def of_responses(self, responses: Responses) -> Float64[np.ndarray, "responses readouts"]:
         """y of other responses; raises UnusableData if the times of their trials are not known."""
         presented, place = responses.presentations
-        if presented.time_s is None:
+        if (clock_s := presented.clock_s) is None:
             raise UnusableData("responses.presented.time_s: expected the times of all trials, got none")
         state, history = self.remembering.at_rest, []
-        trials = (presented.time_s, presented.is_rested, presented.condition, presented.rate_hz, presented.is_burst)
+        trials = (clock_s, presented.is_rested, presented.condition, presented.rate_hz, presented.is_burst)
         for at_s, is_rested, condition, rate_hz, is_burst in zip(*(x.tolist() for x in trials), strict=True):
             at_trial = self.remembering.when(state, at_s, is_rested=is_rested)
             state = self.remembering.after(at_trial, condition, rate_hz, is_burst=is_burst)

@@ -11,6 +11,8 @@ from animat.neurons.simulator import PERCENTILES, HistogramSimulator, to_jax
 
 MEANS_HZ = (30.0, 36.0, 42.0, 48.0, 54.0)
 """Mean responses to the five conditions, in the order of 5, 10, 20, 40 and 80 Hz."""
+LEAST_SHAPE = 0.1
+"""With a smaller one the low percentiles are closer to 0 than numbers can tell apart."""
 LABELS = ("5 Hz", "10 Hz", "20 Hz", "40 Hz", "80 Hz")
 
 
@@ -29,7 +31,7 @@ def synthetic_simulator(means_hz: Sequence[float] = MEANS_HZ, *, shape: float = 
         shape: of all gamma distributions; the larger, the narrower.
 
     Raises:
-        InvalidArgument: for no means, or a number that is not positive.
+        InvalidArgument: for no means, a mean that is not positive, or a shape below 0.1.
     """
     from scipy.optimize import brentq
     from scipy.special import gammainc
@@ -37,8 +39,8 @@ def synthetic_simulator(means_hz: Sequence[float] = MEANS_HZ, *, shape: float = 
     means = np.asarray(means_hz, np.float64)
     if means.ndim != 1 or not len(means) or not np.all(np.isfinite(means) & (means > 0)):
         raise InvalidArgument(f"means_hz: expected a positive mean in Hz per condition, got {means_hz!r}")
-    if not (np.isfinite(shape) and shape > 0):
-        raise InvalidArgument(f"shape: expected a positive number, got {shape!r}")
+    if not (np.isfinite(shape) and shape >= LEAST_SHAPE):
+        raise InvalidArgument(f"shape: expected a number from {LEAST_SHAPE} up, got {shape!r}")
 
     edges_hz = np.linspace(0.0, 120.0 * (means.max() / MEANS_HZ[-1]), 21)
     cumulative = gammainc(shape, edges_hz * shape / means[:, None])

@@ -38,7 +38,7 @@ from animat.reality_gap.reasons import Evidence, reasons
 from animat.reality_gap.session_responses import read_responses
 from animat.reality_gap.session_rows import ALL_POLICIES, session_rows
 from animat.reality_gap.simulation import Simulation
-from animat.reality_gap.table import RealityGap, intervention_table
+from animat.reality_gap.table import INTERVENTIONS, RealityGap, intervention_table
 from animat.recordings.findings import Finding, warnings_once
 from animat.robots.base import Robot, lacking
 from animat.robots.grid import grid_of_optimum, why_no_grid
@@ -136,7 +136,8 @@ def run_policies(
     if with_interventions:
         interventions, ideal = simulation.interventions()
         controls += interventions
-    own = controls_of_own(agents or {}, *simulation.within, [*policies, *(control.name for control in controls)])
+    taken = [ALL_POLICIES, "coupling", *INTERVENTIONS, *policies, *(control.name for control in controls)]
+    own = controls_of_own(agents or {}, *simulation.within, taken)
     acting = {name: Greedy(policy) if greedy else policy for name, policy in policies.items()}
     taking_turns = simulation.agents(acting, (*controls, *own), calibration)
 

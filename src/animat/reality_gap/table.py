@@ -31,7 +31,7 @@ LARGE_SHARE = 0.1
 """Share of the range from random to optimal return: a gap this large is mentioned even if it may be chance."""
 
 
-_INTERVENTIONS = ("random spikes", "silent", "shuffled", "yoked", "turned round", "goal switched")
+INTERVENTIONS = ("random spikes", "silent", "shuffled", "yoked", "turned round", "goal switched")
 """Interventions that are measured, in the order of the table."""
 INTERVENTION_EPISODES = 100
 """Episodes of each policy on the simulator, with an ideal actuator and for the median length of an episode."""
@@ -218,7 +218,7 @@ def intervention_table(rows: Sequence[Row], ideal: Control, with_ideal: Returns)
         Intervention("its simulator", "as predicted", False, float(rows[0].predicted.mean()), rows[0].gap),
         Intervention(ideal.name, ideal.meaning, False, float(with_ideal.mean()), lost),
     ]
-    for row in (measured[name] for name in _INTERVENTIONS if name in measured):
+    for row in (measured[name] for name in INTERVENTIONS if name in measured):
         lost = _loss(rows[0], row.from_mean_start, row.turn)
         table.append(Intervention(row.name, row.meaning, True, float(row.measured.mean()), lost))
     return tuple(table)

@@ -105,10 +105,12 @@ def extract_responses(
     # Silence is measured between pulses: a trial of several, however long, has none. Rows without times are taken as
     # successive, and nothing is known about what came before the first.
     has_times = isinstance(source, Recording) or source.has_times
-    since_s = np.diff(stimuli.time_s, prepend=-np.inf) + begins * setup_s
+    waits_s = begins * setup_s
+    since_s = np.diff(stimuli.time_s, prepend=-np.inf) + waits_s
     silences = np.cumsum(since_s > SILENCE_S)
     is_rested = (np.diff(silences[presented], prepend=0) > 0) & has_times
     time_s = stimuli.time_s[presented] if has_times else None
+    set_up_s = np.cumsum(waits_s)[presented] if has_times and waits_s.any() else None
     responses = Responses(
         condition=condition[chosen],
         rate_hz=rate_hz[chosen],
@@ -123,7 +125,7 @@ def extract_responses(
         start_min=source.start_min,
         recorded_at=source.recorded_at,
         time_s=None if time_s is None else time_s[chosen],
-        presented=Trials(condition, rate_hz, active_ratio > bursts.threshold, is_rested, time_s),
+        presented=Trials(condition, rate_hz, active_ratio > bursts.threshold, is_rested, time_s, set_up_s),
         place=np.flatnonzero(chosen),
         by=str(by),
         burst_threshold=burst_threshold,

@@ -31,7 +31,8 @@ class Trials:
     Attributes:
         condition: index of each, `NO_CONDITION` if it has none.
         is_rested: whether there was no pulse for `extraction.SILENCE_S` before it.
-        time_s: of the pulse after which it was read; None if it is not known.
+        time_s: of the pulse after which it was read, on the recording's clock; None if it is not known.
+        set_up_s: how long stimulation was set up until then, between blocks, which that clock leaves out; None: never.
     """
 
     __repr__ = briefly
@@ -41,6 +42,12 @@ class Trials:
     is_burst: Bool[np.ndarray, " presentations"]
     is_rested: Bool[np.ndarray, " presentations"]
     time_s: Float64[np.ndarray, " presentations"] | None = None
+    set_up_s: Float64[np.ndarray, " presentations"] | None = None
+
+    @property
+    def clock_s(self) -> Float64[np.ndarray, " presentations"] | None:
+        """When each was read, on a clock that runs on between blocks; None if it is not known."""
+        return self.time_s if self.time_s is None or self.set_up_s is None else self.time_s + self.set_up_s
 
     def __post_init__(self) -> None:
         for name, column in vars(self).items():
