@@ -177,6 +177,13 @@ def in_this_process() -> Iterator[None]:
 
 
 @pytest.fixture
+def quick_coupling(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A best coupling from a short search, for tests of what is done with it; `test_coupling` tests the search."""
+    monkeypatch.setattr("animat.evaluation.coupling.GENERATIONS", 2)
+    monkeypatch.setattr("animat.evaluation.coupling.FRESH_EPISODES", 16)
+
+
+@pytest.fixture
 def few_bootstraps(monkeypatch: pytest.MonkeyPatch) -> None:
     """Predictions with intervals from few simulators, for tests of what else a closed loop says and does."""
     monkeypatch.setattr("animat.reality_gap.calibration.BOOTSTRAPS", 4)

@@ -55,6 +55,7 @@ def test_it_is_the_optimum_of_the_default_simulator_above_random_and_constant_st
 
 
 @pytest.mark.oracle
+@pytest.mark.usefixtures("quick_coupling")
 def test_inspect_reports_the_optimum(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -1047,11 +1047,8 @@ def test_whose_work_it_is_in_a_loop(tmp_path: Path, series: list[Responses]) -> 
 
 
 @pytest.mark.oracle
-@pytest.mark.usefixtures("few_bootstraps")
-def test_the_best_coupling_runs_with_the_policies(
-    tmp_path: Path, series: list[Responses], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("animat.evaluation.coupling.GENERATIONS", 2)
+@pytest.mark.usefixtures("few_bootstraps", "quick_coupling")
+def test_the_best_coupling_runs_with_the_policies(tmp_path: Path, series: list[Responses]) -> None:
     gap, _ = run(tmp_path, series, with_controls=False, with_coupling=True)
     coupling = {row.name: row for row in gap.rows}["coupling"]
     rewards = [tick.reward or 0.0 for tick in read_session(tmp_path).ticks if tick.agent == "coupling"]

@@ -122,6 +122,7 @@ def test_the_command_line_trains_evaluates_and_runs_it(package: Path, capsys: An
 
 
 @pytest.mark.oracle
+@pytest.mark.usefixtures("in_this_process", "quick_coupling")
 def test_a_study_has_conditions_with_it(package: Path) -> None:
     study = Study(
         culture=Source("files", files=("data/tiny/recording_0000_min.npz",)),
@@ -130,6 +131,7 @@ def test_a_study_has_conditions_with_it(package: Path) -> None:
         policies=1,
         episodes=2,
         episodes_over_time=2,
+        optimum_resolution=0.25,
         algorithm={"environments": 8, "gradient_steps": 1, "batch": 16, "replay": 256, "hidden": 8},
     )
     (package / "study.toml").write_text(study_to_toml(study))

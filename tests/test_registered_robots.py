@@ -146,6 +146,7 @@ def test_the_command_line_trains_evaluates_and_runs_it(package: Path, capsys: An
 
 
 @pytest.mark.oracle
+@pytest.mark.usefixtures("in_this_process", "quick_coupling")
 def test_a_study_leaves_out_what_it_cannot_do_and_says_so(package: Path) -> None:
     robot_named(ROVER)
     study = Study(
