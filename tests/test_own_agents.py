@@ -261,7 +261,7 @@ def test_an_agent_runs_beside_policies_with_its_own_prediction(tmp_path: Path, m
     error = np.hypot(like.std() / len(like) ** 0.5, p1.std() / len(p1) ** 0.5)
     assert abs(like.mean() - p1.mean()) < 4 * error + 1e-9
     assert rows["like p1"].comparison is not None and "your own agent" in gap.to_text()
-    for name in ("p0", "policies", "coupling", "silent"):
+    for name in ("p0", "policies", "coupling", "silent", "ideal actuator"):
         message = f"agents: expected names other than .*, got {name}"
         with FakeCulture() as culture, pytest.raises(InvalidArgument, match=message):
             run_policies(policies, culture, Calibration.of_series(series), tmp_path / "b", agents={name: Wrong(0)})

@@ -777,15 +777,7 @@ CURRENT = Pulse((Phase(160.0, amplitude_ua=-1.0), Phase(160.0, amplitude_ua=1.0)
 
 @pytest.mark.oracle
 @pytest.mark.usefixtures("few_bootstraps")
-@pytest.mark.parametrize(
-    "case",
-    [
-        *("recorded", "given", "replay of current"),
-        "unknown",
-        "session",
-        "replay",
-    ],
-)
+@pytest.mark.parametrize("case", ["recorded", "given", "unknown", "session", "replay", "replay of current"])
 def test_a_loop_delivers_what_its_recording_was_made_with(
     case: str, tmp_path: Path, recordings: list[Recording], series: list[Responses]
 ) -> None:

@@ -191,11 +191,8 @@ def soft_solution(pay: float) -> tuple[float, float, float]:
     return alpha, p, ((2 * p - 1) * pay + alpha * wanted) / (1 - CLOSED_FORM.discount)
 
 
-OTHERS = ((10**9, False), (10**9, True), (1, False))
-
-
 @pytest.mark.oracle
-@pytest.mark.parametrize(("limit", "ends"), [(3, False), *OTHERS])
+@pytest.mark.parametrize(("limit", "ends"), [(1, False), (3, False), (10**9, False), (10**9, True)])
 def test_critics_converge_to_the_closed_form(limit: int, ends: bool) -> None:
     """One state, two actions: what is ahead ends with the episode, and critics know how much of it is left."""
     robot = Payer(pay=0.8, ends=ends, episode_limit=limit)

@@ -317,6 +317,9 @@ def test_of_very_many_recordings_the_newest_are_watched(tmp_path: Path) -> None:
     assert [file.name for file in recordings_in(tmp_path)] == [f"recording_{n:04d}_min.nwb" for n in range(500)]
     complete = facts(RecordingView(tmp_path).view(None, 8.0), "Recordings")["complete"]
     assert complete == "500 or more: only the newest are watched"
+    for n in range(499, 600):
+        (tmp_path / f"recording_{n:04d}_min.nwb").unlink()
+    assert facts(RecordingView(tmp_path).view(None, 8.0), "Recordings")["complete"] == 499
 
 
 def test_a_folder_is_locked_during_a_run(tmp_path: Path) -> None:

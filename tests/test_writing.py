@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from animat.errors import InvalidFile, Mismatch
-from animat.writing import LOCK, atomic_write, clear_away, exclusive_lock, is_unfinished, write_whole
+from animat.writing import LOCK, atomic_write, clear_away, exclusive_lock, is_unfinished
 
 
 def test_a_whole_file_takes_the_old_ones_place_with_the_rights_of_a_new_one(tmp_path: Path) -> None:
@@ -110,16 +110,28 @@ def test_a_folder_is_for_one_run_at_a_time_until_that_is_killed(tmp_path: Path) 
 @pytest.mark.parametrize("is_made_anew", [False, True])
 def test_a_folder_that_is_removed_during_a_run_is_an_error(is_made_anew: bool, tmp_path: Path) -> None:
     folder = tmp_path / "a"
-    message = "a: it was removed or replaced during the run, and what had been written to it is lost: run it again"
+    message = "a: it was removed, moved or replaced during the run: what was written to it before is lost, or"
     with pytest.raises(InvalidFile, match=message), exclusive_lock(folder):
         (folder / "first").touch()
         shutil.rmtree(folder)
         if is_made_anew:
-            write_whole(folder / "second", "")
+            # As another run does that has written nothing yet.
+            folder.mkdir()
+    assert folder.exists() == is_made_anew
     # Another error stays as it is.
     with pytest.raises(ValueError, match="mine"), exclusive_lock(folder):
         shutil.rmtree(folder)
         raise ValueError("mine")
+
+
+def test_a_folder_is_the_same_wherever_a_program_goes_on_working(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with exclusive_lock("a"):
+        (tmp_path / "b").mkdir()
+        monkeypatch.chdir(tmp_path / "b")
+    assert (tmp_path / "a").is_dir()
 
 
 def without_locks(patch: pytest.MonkeyPatch, *, of_files: bool) -> None:

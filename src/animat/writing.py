@@ -93,19 +93,21 @@ def exclusive_lock(folder: str | os.PathLike[str]) -> Iterator[None]:
 
     Raises:
         Mismatch: if another run is using it.
-        InvalidFile: if it cannot be created, is empty and cannot be written to, or was removed during the block.
+        InvalidFile: if it cannot be created, is empty and cannot be written to, or was replaced or is gone at the end.
     """
     folder = Path(folder)
+    # Its place, whatever folder the program goes on working in.
+    place = folder.absolute()
     with locked(folder) as descriptor:
         yield
-        if not _is_same(folder, descriptor):
-            lost = "what had been written to it is lost"
-            raise InvalidFile(f"{folder}: it was removed or replaced during the run, and {lost}: run it again")
+        if not _is_same(place, descriptor):
+            elsewhere = "what was written to it before is lost, or where it was moved to"
+            raise InvalidFile(f"{folder}: it was removed, moved or replaced during the run: {elsewhere}")
 
 
 @contextmanager
 def locked(folder: Path) -> Iterator[int]:
-    """As `exclusive_lock`, of a folder that may be removed; yields its descriptor."""
+    """As `exclusive_lock`, but the folder may be gone at the end; yields its descriptor."""
     with as_invalid_file(folder, "cannot be created or read", "; choose another --out"):
         created = [each for each in (folder, *folder.parents) if not each.exists()]
         if not folder.is_dir() or not any(folder.iterdir()):
@@ -123,8 +125,9 @@ def locked(folder: Path) -> Iterator[int]:
         try:
             yield descriptors[0]
         except BaseException:
-            with suppress(OSError):
-                for each in created:
+            # Not another run's in its place.
+            with suppress(OSError, InvalidFile):
+                for each in created if _is_same(folder, descriptors[0]) else ():
                     each.rmdir()
             raise
     finally:
@@ -150,9 +153,12 @@ def _expect_same(folder: Path, descriptor: int) -> None:
 
 
 def _is_same(folder: Path, descriptor: int) -> bool:
-    with suppress(OSError):
+    try:
         return os.path.samestat(os.fstat(descriptor), folder.stat())
-    return False
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    except OSError as error:
+        raise InvalidFile(f"{folder}: cannot be read: {error.strerror or error}") from error
 
 
 def clear_away(leftover: Path) -> None:

@@ -51,7 +51,7 @@ def sees_neurons(controller: Controller) -> bool:
 
 
 def index_of(chosen: Any) -> int:
-    """The chosen index as a plain number; TypeError if it is none, as True, which is no index in numpy either."""
+    """The chosen index as a plain number; TypeError for anything else, also for True, which numpy does not take."""
     if isinstance(chosen, bool):
         raise TypeError(f"expected the index of a condition, got {chosen}")
     return operator.index(chosen)

@@ -133,8 +133,8 @@ def interventions_of(
 
     Without `switch_at`, the iteration of the goal's switch, that one is left out, as for a robot with one goal.
     """
-    # Mean commands stretched to -1 to 1, each dimension separately; 0 where all are equal. They are those of conditions
-    # delivered: with shuffled delivery, each chosen one has the mean of all.
+    # Mean commands stretched to -1 to 1, each dimension separately; 0 where all are equal. They belong to delivered
+    # conditions: under shuffled delivery all chosen ones would have the same.
     means = mean_commands(wrappers.unwrapped(environment), simulator)[1]
     low, high = means.min(axis=0), means.max(axis=0)
     stretched = 2 * (means - low) / np.where(high > low, high - low, np.inf) - (high > low)

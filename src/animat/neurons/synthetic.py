@@ -12,7 +12,7 @@ from animat.neurons.simulator import PERCENTILES, HistogramSimulator, to_jax
 MEANS_HZ = (30.0, 36.0, 42.0, 48.0, 54.0)
 """Mean responses to the five conditions, in the order of 5, 10, 20, 40 and 80 Hz."""
 LEAST_SHAPE = 0.1
-"""With a smaller one the low percentiles are closer to 0 than numbers can tell apart."""
+"""With a smaller one the lowest percentiles are below the accuracy with which they are found."""
 LABELS = ("5 Hz", "10 Hz", "20 Hz", "40 Hz", "80 Hz")
 
 

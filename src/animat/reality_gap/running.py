@@ -136,7 +136,8 @@ def run_policies(
     if with_interventions:
         interventions, ideal = simulation.interventions()
         controls += interventions
-    taken = [ALL_POLICIES, "coupling", *INTERVENTIONS, *policies, *(control.name for control in controls)]
+    taken = [ALL_POLICIES, "coupling", "ideal actuator", *INTERVENTIONS, *policies]
+    taken += [control.name for control in controls]
     own = controls_of_own(agents or {}, *simulation.within, taken)
     acting = {name: Greedy(policy) if greedy else policy for name, policy in policies.items()}
     taking_turns = simulation.agents(acting, (*controls, *own), calibration)

@@ -32,7 +32,7 @@ class Trials:
         condition: index of each, `NO_CONDITION` if it has none.
         is_rested: whether there was no pulse for `extraction.SILENCE_S` before it.
         time_s: of the pulse after which it was read, on the recording's clock; None if it is not known.
-        set_up_s: how long stimulation was set up until then, between blocks, which that clock leaves out; None: never.
+        set_up_s: seconds of setting up stimulation until then, which that clock leaves out; None: none.
     """
 
     __repr__ = briefly

@@ -50,7 +50,8 @@ class RecordingView(View):
         recording, inspection, error = self._newest_inspection(times_s, newest)
         in_progress = self.folder / UNDER_WAY in times_s
         n_whole = len(times_s) - in_progress
-        blocks = [facts("Recordings", _facts(inspection, n_whole, newest))]
+        complete = n_whole if len(times_s) < MOST_RECORDINGS else f"{n_whole:,} or more: only the newest are watched"
+        blocks = [facts("Recordings", _facts(inspection, complete, newest))]
         span: dict[str, Any] = {"from_s": 0.0, "to_s": 0.0, "end_s": 0.0}
         if recording is not None:
             raster, span = _raster(recording, to_s, span_s)
@@ -85,9 +86,8 @@ class RecordingView(View):
         return self._content
 
 
-def _facts(inspection: Inspection | None, n_whole: int, newest: Path) -> list[tuple[str, Any]]:
+def _facts(inspection: Inspection | None, complete: int | str, newest: Path) -> list[tuple[str, Any]]:
     shown = "the one in progress, as far as it has come" if newest.name == UNDER_WAY else newest.name
-    complete = n_whole if n_whole < MOST_RECORDINGS - 1 else f"{n_whole} or more: only the newest are watched"
     rows: list[tuple[str, Any]] = [("complete", complete), ("shown", shown)]
     if inspection is not None:
         rows += [
