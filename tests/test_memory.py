@@ -868,13 +868,13 @@ def test_a_memory_of_blocks_is_reported() -> None:
 def test_the_load_decays_while_stimulation_is_set_up_between_blocks() -> None:
     recording = SyntheticCulture(1, channels=32, patterns=20).record(0)
     protocol = Protocol(patterns=20, trials=20, setup_s=14.0)
-    presented = extract_responses(replace(recording, protocol=protocol), burst_threshold=0.95).presentations[0]
+    responses = extract_responses(replace(recording, protocol=protocol), burst_threshold=0.95)
+    presented = responses.presentations[0]
     at_once = extract_responses(recording, burst_threshold=0.95).presentations[0]
     assert presented.clock_s is not None and presented.time_s is not None and at_once.clock_s is at_once.time_s
     is_first = np.arange(100) % 20 == 0
     waited_s = np.diff(presented.clock_s) - np.diff(presented.time_s)
     np.testing.assert_allclose(waited_s, np.where(is_first[1:], 14.0, 0.0), atol=1e-9)
-    responses = extract_responses(replace(recording, protocol=protocol), burst_threshold=0.95)
     loads = Ranked(responses).loads(1.0).every
     assert np.all(loads[is_first] < 1e-5) and np.all(loads[~is_first] > 1e-3)
 
