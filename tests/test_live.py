@@ -48,7 +48,9 @@ from animat.stimulation.stimulus import Stimulus
 from animat.training.policy import load_policies
 from animat.training.settings import SAC
 from animat.training.specification import Training
+from animat.watch.live import LiveView
 from animat.watch.recording import RecordingView
+from animat.writing import exclusive_lock
 from cultures import small_culture
 from fake_culture import FakeCulture
 
@@ -125,6 +127,43 @@ def test_recordings_are_watched_as_they_are_made(ran: tuple[LiveRun, Path, int],
     after = RecordingView(folder).view(None, 8.0)
     assert (after["state"], dict(after["blocks"][0]["rows"])["complete"]) == ("ended", 3)
     assert not (folder / under_way.UNDER_WAY).exists()
+
+
+def test_what_has_happened_is_watched(ran: tuple[LiveRun, Path, int]) -> None:
+    found, folder, _ = ran
+    view = LiveView(folder)
+    assert view.about()["title"] == "live training of navigation policies"
+    shown = view.view(None, 8.0)
+    assert (shown["state"], shown["message"]) == ("ended", found.gap.session.ending.message)
+    so_far, curves, *_, events = shown["blocks"]
+    rows = dict(so_far["rows"])
+    assert rows["recordings"] == 3 and rows["minutes of training"] == 30.0
+    assert rows["minutes at the last event"] == pytest.approx(lines(folder)[-1]["culture_min"] - 0.2, abs=0.06)
+    assert rows["iterations of each"] == f"{found.iterations:,}"
+    assert rows["pulses so far"] == found.gap.account.pulses
+    minutes = [f"minute {swap['recorded_at_min']:g}" for swap in found.swaps]
+    assert curves["marks"] == [[swap["iterations"], at] for swap, at in zip(found.swaps, minutes, strict=True)]
+    assert rows["newest in use"] == f"that of {minutes[-1]}"
+    *each, mean = curves["series"]
+    assert [of["y"] for of in each] == [
+        [None if np.isnan(y) else pytest.approx(y) for y in policy.learning_curve[:, 2].tolist()]
+        for policy in found.policies.values()
+    ]
+    assert mean["x"][-1] == found.iterations
+    assert [row[1] for row in events["rows"]] == [line["what"] for line in lines(folder)][::-1]
+
+
+def test_a_live_run_is_watched_until_it_is_killed(ran: tuple[LiveRun, Path, int], tmp_path: Path) -> None:
+    whole = (ran[1] / LOG_FILE).read_text().splitlines(keepends=True)
+    for n, message in ((1, "the first recording is made"), (5, "training"), (9, "training has ended")):
+        (tmp_path / LOG_FILE).write_text("".join(whole[:n]))
+        with exclusive_lock(tmp_path):
+            shown = LiveView(tmp_path).view(None, 8.0)
+            assert shown["state"] == "running" and shown["message"].startswith(message)
+        killed = LiveView(tmp_path).view(None, 8.0)
+        assert killed["state"] == "silent" and "was killed" in killed["message"]
+    (tmp_path / LOG_FILE).write_text(whole[0] + '{"what": "fault", "message": "gone"}\n{"what": "end"}\n')
+    assert LiveView(tmp_path).view(None, 8.0)["message"] == "gone"
 
 
 def test_every_simulator_is_swapped_in_once_dated_and_kept_with_the_policies(ran: tuple[LiveRun, Path, int]) -> None:

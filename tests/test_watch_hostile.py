@@ -27,6 +27,7 @@ from animat.closed_loop.session import LOG_FILE
 from animat.errors import AnimatError
 from animat.training.policy import CURVE
 from animat.watch.discovery import find
+from animat.watch.live import LiveView
 from animat.watch.session import SessionView
 from animat.watch.study import StudyView
 from animat.watch.training import TrainingView
@@ -162,12 +163,25 @@ STUDY = {"study": {"robots": [{"name": "cartpole"}]}, "fingerprint": "x"}
 TUNING = {"tune": {"trials": 5}, "study": {"robots": [{"name": "cartpole"}]}}
 TRIAL = {"trial": 0, "settings": {"discount": 0.9}, "state": "complete", "chunks": [7], "returns": [[1.0, 2.0]]}
 
+LIVE = (
+    {"culture_min": 0.2, "what": "begun", "robot": "cartpole", "policies": 2, "duration_min": 30.0},
+    {"culture_min": 0.4, "what": "recording", "file": "a.nwb", "budget": {"pulses": 9, "of": None}},
+    {"culture_min": 10.4, "what": "swap", "members": [0, 1], "iterations": 300, "recorded_at_min": 10.2},
+    {"culture_min": 30.4, "what": "closed loop", "ended": "all episodes were run"},
+    {"culture_min": 30.4, "what": "end", "budget": {"pulses": 10}},
+)  # fmt: skip
+
 
 @seeds(60)
 def test_folders_with_anything_in_them(tmp_path: Path, seed: int) -> None:
     draw = Random(seed)
     kind, name, words = draw.choice(
-        [(TrainingView, "training.json", TRAINING), (StudyView, "study.json", STUDY), (TuningView, "tune.json", TUNING)]
+        [
+            (TrainingView, "training.json", TRAINING),
+            (StudyView, "study.json", STUDY),
+            (TuningView, "tune.json", TUNING),
+            (LiveView, "live.log", LIVE[0]),
+        ]
     )
     (tmp_path / name).write_text(json.dumps(changed(words, draw.choice(places(words)), anything(draw))))
     trial = changed(TRIAL, draw.choice(places(TRIAL)), anything(draw))
@@ -218,6 +232,18 @@ def test_a_strange_file_costs_no_more_than_its_own_panel(
             found = kind(tmp_path).view(None, 8.0)
             json.dumps(found, allow_nan=False).encode()
             assert found["blocks"][0]["title"] == first["title"] and len(found["blocks"]) > 2
+
+
+def test_a_strange_line_costs_no_more_than_itself_in_a_live_run(tmp_path: Path) -> None:
+    for number, event in enumerate(LIVE):
+        for place in places(event)[1:]:
+            for strange in (None, True, -1, 10**400, 1e300, math.nan, math.inf, *HOSTILE[:3], [], {}, [1, None]):
+                lines = [json.dumps(each) for each in LIVE]
+                lines[number] = json.dumps(changed(event, place, strange))
+                (tmp_path / "live.log").write_text("\n".join([*lines, "no JSON", "[]", '{"what": "tru']))
+                found = LiveView(tmp_path).view(None, 8.0)
+                json.dumps(found, allow_nan=False).encode()
+                assert len(found["blocks"]) == 6 and len(found["blocks"][-1]["rows"]) >= len(LIVE) - 1
 
 
 @pytest.mark.oracle

@@ -16,6 +16,7 @@ from animat.cli import COMMANDS, main
 from animat.closed_loop.log import LogWriter, read_log
 from animat.closed_loop.session import LOG_FILE
 from animat.closed_loop.tick import STOP_FILE
+from animat.live.plan import LOG_FILE as LIVE
 from animat.studies.cultures import MANIFEST as CULTURES
 from animat.studies.folder import MANIFEST as STUDY
 from animat.training.folder import MANIFEST as TRAINING
@@ -200,6 +201,7 @@ def test_folders_are_identified_by_the_files_that_are_written() -> None:
         "tuning": TUNING,
         "study": STUDY,
         "cultures": CULTURES,
+        "live": LIVE,
     }
 
 

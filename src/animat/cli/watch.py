@@ -17,7 +17,7 @@ class Watch(Command):
     """Serve a page of what runs, ran or was killed in a folder, for a browser on this machine, until Ctrl-C."""
 
     folder: Positional[Path]
-    """Folder of a session, a training, a study, a tuning, recordings, or several of these"""
+    """Folder of a session, a training, a live run, a study, a tuning, recordings, or several of these"""
     port: int = 0
     """Port to listen on, on this machine only; 0: any free port"""
 

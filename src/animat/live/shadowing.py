@@ -115,47 +115,48 @@ def live(
     timetable = timetable or Timetable()
     account = account or Account()
     check_plan(training, protocol, Path(folder), timetable, episodes, settings, account)
-    schedule = culture.schedule(protocol, order_seed(training.seed, 0))
-    with for_the_first_recording():
-        account.check([stimulus for block in schedule.blocks for stimulus in schedule.deliveries(block)])
-    if report is not None:
-        report(f"each pulse: {protocol.pulse}")
-    training = replace(training, duration_min=timetable.duration_min, shadowing=True)
-    run = _Run(training, culture, protocol, Path(folder), timetable, kind, account)
-    try:
-        policies = run.shadow(progress)
-        first, at_min = next(iter(policies.values())), run.used[-1].start_min
-        calibration = Calibration.of_series(run.used, first, at_min=at_min, adaptive=adaptive, kind=kind)
-        # The session has its own lock, by which viewers see that it is running.
-        with exclusive_lock(run.folder / SESSION):
-            gap = run_policies(
-                policies,
-                culture,
-                calibration,
-                run.folder / SESSION,
-                episodes=episodes,
-                with_controls=with_controls,
-                seed=training.seed,
-                account=run.account,
-                progress=progress,
-                report=report,
-                **settings,
-            )
-        run.write("closed loop", **gap.session.to_dict())
-        # If the culture failed or hangs, its state may be inconsistent; that after its last recording is not.
-        if gap.session.ending.by not in ("culture", "hang"):
-            run.keep_state()
-    except BaseException as error:
-        run.end_early(error)
-        with suppress(InvalidFile):
-            run.write("end", budget=run.account.to_dict())
-        if any((run.folder / POLICIES).glob("p*.safetensors")):
-            of = str(run.folder / POLICIES), "--recordings", str(run.folder / RECORDINGS)
-            command = shlex.join(("animat", "run", *of))
-            error.add_note(f"what was trained so far can still be run: {command}")
-        raise
-    run.write("end", budget=run.account.to_dict())
-    return LiveRun(tuple(run.files), policies, tuple(run.swaps), run.iterations, run.culture_min, run.wall_s, gap)
+    with exclusive_lock(folder):
+        schedule = culture.schedule(protocol, order_seed(training.seed, 0))
+        with for_the_first_recording():
+            account.check([stimulus for block in schedule.blocks for stimulus in schedule.deliveries(block)])
+        if report is not None:
+            report(f"each pulse: {protocol.pulse}")
+        training = replace(training, duration_min=timetable.duration_min, shadowing=True)
+        run = _Run(training, culture, protocol, Path(folder), timetable, kind, account)
+        try:
+            policies = run.shadow(progress)
+            first, at_min = next(iter(policies.values())), run.used[-1].start_min
+            calibration = Calibration.of_series(run.used, first, at_min=at_min, adaptive=adaptive, kind=kind)
+            # The session has its own lock, by which viewers see that it is running.
+            with exclusive_lock(run.folder / SESSION):
+                gap = run_policies(
+                    policies,
+                    culture,
+                    calibration,
+                    run.folder / SESSION,
+                    episodes=episodes,
+                    with_controls=with_controls,
+                    seed=training.seed,
+                    account=run.account,
+                    progress=progress,
+                    report=report,
+                    **settings,
+                )
+            run.write("closed loop", **gap.session.to_dict())
+            # If the culture failed or hangs, its state may be inconsistent; that after its last recording is not.
+            if gap.session.ending.by not in ("culture", "hang"):
+                run.keep_state()
+        except BaseException as error:
+            run.end_early(error)
+            with suppress(InvalidFile):
+                run.write("end", budget=run.account.to_dict())
+            if any((run.folder / POLICIES).glob("p*.safetensors")):
+                of = str(run.folder / POLICIES), "--recordings", str(run.folder / RECORDINGS)
+                command = shlex.join(("animat", "run", *of))
+                error.add_note(f"what was trained so far can still be run: {command}")
+            raise
+        run.write("end", budget=run.account.to_dict())
+        return LiveRun(tuple(run.files), policies, tuple(run.swaps), run.iterations, run.culture_min, run.wall_s, gap)
 
 
 @dataclass(eq=False)
@@ -182,8 +183,8 @@ class _Run:
         self._known_s = self._zero_s
         with as_invalid_file(self.folder, "cannot be made"):
             self.folder.mkdir(parents=True, exist_ok=True)
-        training = self.training
-        self.write("begun", robot=training.robot.name, policies=training.policies, seed=training.seed)
+        training, times = self.training, {"duration_min": self.timetable.duration_min}
+        self.write("begun", robot=training.robot.name, policies=training.policies, seed=training.seed, **times)
 
     def shadow(self, progress: Progress | None) -> dict[str, Policy]:
         """Record and train to the end; returns the policies."""

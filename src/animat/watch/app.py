@@ -24,6 +24,7 @@ from starlette.websockets import WebSocket
 from animat.errors import AnimatError, InvalidArgument, first_line
 from animat.watch.discovery import find, place_within
 from animat.watch.files import text
+from animat.watch.live import LiveView
 from animat.watch.recording import RecordingView
 from animat.watch.session import SessionView, stop_session
 from animat.watch.study import CulturesView, StudyView
@@ -33,7 +34,8 @@ from animat.watch.view import View
 
 _MOST_VIEWS = 8
 _VIEWS: dict[str, type[View]] = {
-    view.kind: view for view in (SessionView, TrainingView, StudyView, CulturesView, TuningView, RecordingView)
+    view.kind: view
+    for view in (LiveView, SessionView, TrainingView, StudyView, CulturesView, TuningView, RecordingView)
 }
 _Query = Mapping[str, str]
 

@@ -17,7 +17,7 @@ from animat.folders import MARKERS, FolderKind
 from animat.recordings.formats.npz import UNDER_WAY
 from animat.writing import LOCK
 
-_MARKS = {kind: names[0] for kind, names in MARKERS.items() if kind not in ("recording", "live")}
+_MARKS = {kind: names[0] for kind, names in MARKERS.items() if kind != "recording"}
 """The file that identifies each kind."""
 _DEPTH, _MOST_FOLDERS, _MOST_ITEMS = 6, 4000, 2000
 MOST_RECORDINGS = 500

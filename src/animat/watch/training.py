@@ -3,42 +3,26 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float64
 
-from animat.errors import InvalidFile
 from animat.execution.task import UNFINISHED
-from animat.training.policy import CURVE, whole_curve
-from animat.watch.discovery import changed_s, is_locked, state_of
-from animat.watch.files import JobProgress, arrays_in, expect_own, job_progress, json_of, listed, mapped, number, text
-from animat.watch.view import View, chart, curve, facts, in_blocks, settings, table, time_left
+from animat.watch.discovery import is_locked, state_of
+from animat.watch.files import JobProgress, arrays_in, job_progress, json_of, listed, mapped, number, text
+from animat.watch.learning import Curves, curve_of_policy, learning_charts, with_all_columns
+from animat.watch.view import View, facts, in_blocks, settings, table, time_left
 
 _MOST_POLICIES = 1000
 _MOST_BYTES = 2**22
 _CHUNKS = 60
 """Parts of a training, and points of a learning curve."""
-_LEARNER = (
-    ("entropy", "nats", "Of the policy's choice of actions: high while it is almost random, low once it is certain."),
-    ("alpha", "", "The weight of entropy relative to reward, adjusted so that entropy reaches its target."),
-    ("critic_loss", "", "How far the critics are from the returns they learn to predict, in squared scaled rewards."),
-)
-_COLOURS = {"random actions": "grey", "best coupling": "green", "optimal return": "orange"}
-"""Colours of the lines with which returns are compared."""
-
-Curves: TypeAlias = dict[int, Float64[np.ndarray, "chunks columns"]]
-"""Learning curves by policy number, with the columns of `CURVE`."""
 
 
 class TrainingView(View):
     kind = "training"
-
-    def __init__(self, folder: Path) -> None:
-        super().__init__(folder)
-        self._read: dict[Path, tuple[float, Any]] = {}
 
     def _title(self) -> str:
         return f"training of {text(self._manifest()['training']['robot']['name'])} policies"
@@ -71,7 +55,7 @@ class TrainingView(View):
             ("algorithm", settings(training.get("algorithm", {}))),
         ]
         levels, missing = _levels_of(manifest.get("random_return"), json_of(self.folder / "evaluation.json"))
-        charts = _learning_charts(curves, _swaps(training, minutes), iterations, levels, missing)
+        charts = learning_charts(curves, _swaps(training, minutes), iterations, levels, missing)
         return in_blocks(state, [facts("So far", rows), *charts, _table(curves, shares, progress)])
 
     def _curves_so_far(self, planned: int, progress: JobProgress) -> tuple[Curves, dict[int, float]]:
@@ -88,46 +72,19 @@ class TrainingView(View):
                 last = min(int(members[2] or members[1]), planned - 1)
                 shares |= {i: max(shares[i], min(share, 1.0)) for i in range(int(members[1]), last + 1)}
         for i in shares:
-            if (rows := self._cached_content(self.folder / f"p{i}.safetensors", _curve_of_policy)) is not None:
+            if (rows := self._cached_content(self.folder / f"p{i}.safetensors", curve_of_policy)) is not None:
                 curves[i], shares[i] = rows, 1.0
         return {i: curves[i] for i in shares if i in curves}, shares
-
-    def _cached_content(self, path: Path, read: Any) -> Any:
-        """The content of a file, read again only if it changed; None if there is none."""
-        time_s = changed_s(path)
-        if time_s is None:
-            return None
-        if self._read.get(path, (None,))[0] != time_s:
-            self._read[path] = time_s, read(path)
-        return self._read[path][1]
 
 
 def _curves_of_checkpoint(path: Path) -> Curves:
     """The learning curves in a checkpoint, by policy number; empty if it cannot be read."""
     arrays = arrays_in(path, ("curve", "members"), _MOST_BYTES)
-    if arrays is None or (curve := _with_all_columns(arrays[0], 3)) is None:
+    if arrays is None or (curve := with_all_columns(arrays[0], 3)) is None:
         return {}
     if arrays[1].dtype.kind not in "iu" or arrays[1].shape != curve.shape[1:2]:
         return {}
     return {int(member): curve[:, row] for row, member in enumerate(arrays[1].tolist())}
-
-
-def _curve_of_policy(path: Path) -> Float64[np.ndarray, "chunks columns"] | None:
-    """The learning curve in a policy's file; None if it cannot be read."""
-    from safetensors import SafetensorError, safe_open
-
-    try:
-        with safe_open(expect_own(path), framework="numpy") as file:
-            return _with_all_columns(file.get_tensor("learning_curve"), 2)
-    except (InvalidFile, OSError, SafetensorError, ValueError, TypeError):
-        return None
-
-
-def _with_all_columns(curve: np.ndarray, dimensions: int) -> Float64[np.ndarray, "*_ columns"] | None:
-    """Learning curves with the columns of `CURVE`; None for anything else."""
-    whole = whole_curve(curve)
-    is_curve = whole.ndim == dimensions and whole.shape[-1] == len(CURVE) and whole.dtype.kind == "f"
-    return np.asarray(whole, np.float64) if is_curve else None
 
 
 def _in_use(training: dict[str, Any], minutes: list[float], share: float) -> list[tuple[str, Any]]:
@@ -182,44 +139,3 @@ def _levels_of(random_return: float | None, evaluation: Mapping[str, Any]) -> tu
         note += f" Not known: {', '.join(missing)}. To show them, run animat evaluate with --optimum and "
         note += "--out evaluation.json, in this folder."
     return known, note.strip()
-
-
-def _learning_charts(
-    curves: Curves, swaps: Sequence[tuple[float, str]], iterations: float, levels: Mapping[str, float], missing: str
-) -> list[dict[str, Any]]:
-    """The learning curves, and entropy, alpha and critic loss over the same iterations."""
-    series, last = _series(curves, "mean_return")
-    note = "No learning curve is in the folder yet: the first checkpoint is written some seconds after the start."
-    if series:
-        note = f"Mean return of the latest episodes: {'none has ended yet' if last is None else f'{last:.1f}'}. "
-        note += "Grey: each policy; blue: the mean of those that have come so far. A point is a 60th of the training."
-    note += " Dashed vertical: the simulators are refreshed with the recording of that minute." if swaps else ""
-    series += [curve(name, [0.0, iterations], [y, y], "dashed", _COLOURS[name]) for name, y in levels.items()]
-    note = f"{note} {missing}".strip()
-    charts = [chart("Learning curves", "iterations", "return", series, note, marks=swaps, until=iterations)]
-    for column, unit, meaning in _LEARNER:
-        series, last = _series(curves, column)
-        if not series:
-            note = f"Known from the first checkpoint on. {meaning}"
-        elif last is None:
-            note = "Not in these files: they were written before it was kept."
-        else:
-            note = f"{last:.3g} on average, at the last checkpoint. {meaning}"
-        title = column.replace("_", " ").capitalize()
-        charts.append(chart(title, "iterations", unit, series, note, until=iterations, width="third"))
-    return charts
-
-
-def _series(curves: Curves, column: str) -> tuple[list[dict[str, Any]], float | None]:
-    """One column of the curves of each policy, and their mean, with the last value of the mean."""
-    at = CURVE.index(column)
-    series = [curve("", rows[:, 0].tolist(), rows[:, at].tolist(), "thin", "grey") for rows in curves.values()]
-    longest = max(curves.values(), key=len, default=np.zeros((0, len(CURVE))))
-    if not len(longest):
-        return series, None
-    values = np.full((len(curves), len(longest)), np.nan)
-    for row, rows in zip(values, curves.values(), strict=True):
-        row[: len(rows)] = rows[:, at]
-    mean = np.ma.masked_invalid(values).mean(axis=0).filled(np.nan)
-    series.append(curve("mean of the policies", longest[:, 0].tolist(), mean.tolist(), "line", "blue"))
-    return series, next((x for x in mean[::-1].tolist() if np.isfinite(x)), None)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -12,6 +12,7 @@ from typing import Any, ClassVar, Literal
 from animat.errors import InvalidArgument, InvalidFile, first_line
 from animat.folders import MARKERS, FolderKind
 from animat.progress import Speed, format_duration
+from animat.watch.discovery import changed_s
 from animat.watch.files import json_of, number, text
 
 _MOST_SPAN_S = 60.0
@@ -31,6 +32,8 @@ class View(abc.ABC):
     def __init__(self, folder: Path) -> None:
         self.folder, self.file = folder, folder / MARKERS[self.kind][0]
         self._speed = Speed(self.speed_over_s)
+        self._read: dict[Path, tuple[float, Any]] = {}
+        """When each file last changed, and its content."""
 
     def about(self) -> dict[str, Any]:
         """What does not change while work goes on; errors are those of `view`."""
@@ -68,6 +71,15 @@ class View(abc.ABC):
             raise
         except Exception as error:
             raise InvalidFile(f"{self.file}: cannot be shown: {first_line(error)}") from error
+
+    def _cached_content(self, path: Path, read: Callable[[Path], Any]) -> Any:
+        """The content of a file, read again only if it changed; None if there is none."""
+        time_s = changed_s(path)
+        if time_s is None:
+            return None
+        if self._read.get(path, (None,))[0] != time_s:
+            self._read[path] = time_s, read(path)
+        return self._read[path][1]
 
     def _manifest(self) -> dict[str, Any]:
         """The content of the file that describes the folder."""

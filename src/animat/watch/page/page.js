@@ -5,6 +5,7 @@ import { make, shown } from "./draw.js";
 import { SessionPage } from "./session.js";
 
 const KINDS = {
+  live: { name: "live run", page: BlocksPage },
   session: { name: "closed loop", page: SessionPage, seeks: true },
   training: { name: "training", page: BlocksPage },
   study: { name: "study", page: BlocksPage },
@@ -20,9 +21,10 @@ let thing = null, about = null, page = null, view = null;
 let picked = false;
 let following = true, to = null, span = 8, asking = false, timer = 0, again = false;
 
-// The outputs of a study are part of it.
+// The outputs of a study are part of it, as are the recordings of a live run; its closed loop is worth its own page.
 function isPartOf(whole, item) {
-  return ["study", "cultures", "tuning"].includes(whole?.kind) && item.kind !== whole.kind && (!whole.place || item.place.startsWith(`${whole.place}/`));
+  if (whole?.kind === "live" && item.kind === "session") return false;
+  return ["study", "cultures", "tuning", "live"].includes(whole?.kind) && item.kind !== whole.kind && (!whole.place || item.place.startsWith(`${whole.place}/`));
 }
 
 function urlOf(path, more = {}) {
@@ -113,7 +115,7 @@ async function things() {
     const [newest] = content.things;
     const [outermost] = content.things.filter((item) => isPartOf(item, newest)).sort((a, b) => a.place.length - b.place.length);
     if (!thing && newest) choose(outermost ?? newest);
-    if (!thing) $("main").replaceChildren(make("p", { className: "words", textContent: `${content.folder} holds nothing to watch yet: no session, training, study, tuning or recording. It is checked again every few seconds.` }));
+    if (!thing) $("main").replaceChildren(make("p", { className: "words", textContent: `${content.folder} holds nothing to watch yet: no session, training, live run, study, tuning or recording. It is checked again every few seconds.` }));
   } catch {
     // With an item shown, `look` reports the error.
     if (!thing) showError("the page's server does not respond");
