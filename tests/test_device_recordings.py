@@ -173,6 +173,28 @@ def test_a_recording_whose_file_cannot_be_written_is_kept_elsewhere(
     assert not (tmp_path / "recordings" / "interrupted").exists()
 
 
+def test_a_recording_for_which_there_is_no_room_stays_as_it_is_until_there_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    culture, *_ = on_maxone(monkeypatch)
+    protocol = Protocol(**vars(MIXED) | {"pulse": BALANCED_PULSE, "trials": 20})
+
+    def full(recording: Recording, file: Path) -> None:
+        raise InvalidFile(f"{file}: No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("animat.cultures.series.write_nwb", full)
+        patch.setattr("animat.cultures.under_way.write_nwb", full)
+        with pytest.raises(InvalidFile, match="No space") as raised:
+            record_series(lambda: culture, protocol, tmp_path, sessions=1)
+    assert raised.value.__notes__[0] == (
+        f"what was recorded so far is in {tmp_path / UNDER_WAY}: make room, and animat recover keeps it"
+    )
+    assert main(["recover", str(tmp_path)]) == 0
+    (file,) = (tmp_path / "interrupted").iterdir()
+    assert len(read_recording(file).stimuli) == 100 and not (tmp_path / UNDER_WAY).exists()
+
+
 def test_record_says_what_it_will_deliver_and_what_came_late(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -72,7 +72,12 @@ class PartialRecording:
                 error.add_note(_keep(self._so_far(), folder))
                 self.remove()
                 return
-        error.add_note("and then: what was recorded so far could not be kept")
+        # Where there is no room for a recording there may still be some for this file, which is smaller.
+        self._write()
+        if self._path.exists():
+            error.add_note(f"what was recorded so far is in {self._path}: make room, and animat recover keeps it")
+        else:
+            error.add_note("and then: what was recorded so far could not be kept")
 
     def finish(self, recording: Recording, write: Callable[[], object]) -> None:
         """Write the whole recording, on a full disk in place of the file of the one in progress."""
