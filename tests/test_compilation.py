@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import runpy
 import subprocess
@@ -27,6 +28,19 @@ def test_what_cannot_be_kept_is_compiled_all_the_same(monkeypatch: pytest.Monkey
     with pytest.raises(RuntimeError, match="no locator available"):
         numba.njit(cache=True)(doubled)
     assert kept(doubled)(4) == 8
+
+
+def test_what_a_full_disk_cannot_keep_is_compiled_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    def tripled(x: int) -> int:
+        return 3 * x
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(numba.core.caching.IndexDataCacheFile, "save", full)
+    with pytest.raises(OSError, match="No space left"):
+        numba.njit(cache=True)(tripled)(4)
+    assert cached_njit(error_model="numpy")(tripled)(4) == 12
 
 
 def test_nobody_s_home_is_no_error(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import subprocess
 import sys
@@ -19,7 +20,7 @@ from hypothesis.extra import numpy as npst
 from animat.errors import InvalidArgument, InvalidFile
 from animat.recordings.findings import Finding
 from animat.recordings.formats.hdf5_formats import read_hdf5
-from animat.recordings.formats.nwb import write_nwb
+from animat.recordings.formats.nwb import _ErrorKeepingFile, write_nwb
 from animat.recordings.formats.nwb_spikes import write_spikes
 from animat.recordings.reading import read_recording
 from animat.recordings.recorded_culture import RecordedCulture
@@ -287,6 +288,19 @@ def test_a_full_disk_leaves_the_old_file_intact(synthetic: Recording, tmp_path: 
     assert path.read_bytes() == before
     assert [file.name for file in tmp_path.iterdir()] == ["a.nwb"]
     assert read_hdf5(path).equals(synthetic)
+
+
+def test_what_a_full_disk_did_not_take_is_read_as_zeros(tmp_path: Path) -> None:
+    """Otherwise HDF5 works on with whatever the buffer held, which ended the process."""
+    (tmp_path / "a.nwb").touch()
+    with _ErrorKeepingFile(tmp_path / "a.nwb", "r+") as file:
+        file.write(b"taken")
+        file.error = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        assert file.write(b"not taken") == 9
+        file.seek(0)
+        buffer = bytearray(b"x" * 14)
+        assert file.readinto(buffer) == 14
+    assert buffer == b"taken" + bytes(9)
 
 
 WRITE_BESIDE_A_HALF_WRITTEN_CACHE = """

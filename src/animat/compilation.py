@@ -99,15 +99,24 @@ def pynwb_importable() -> Iterator[None]:
 def cached_njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """`numba.njit` with its cache next to the source or in the user's cache.
 
-    If neither is writable (a system package, no home), each process compiles again instead of failing.
+    If neither is writable (a system package, no home, a full disk), each process compiles again instead of failing.
     """
     import numba
 
     def compiled(function: Callable[..., Any]) -> Any:
         try:
-            return numba.njit(cache=True, **options)(function)
+            dispatcher = numba.njit(cache=True, **options)(function)
         except RuntimeError:
             return numba.njit(**options)(function)
+        # Numba has no option for a disk that is full only when the program has been compiled.
+        save = dispatcher._cache.save_overload
+
+        def save_if_possible(*program: Any) -> None:
+            with suppress(OSError):
+                save(*program)
+
+        dispatcher._cache.save_overload = save_if_possible
+        return dispatcher
 
     return compiled
 

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
-from animat.errors import AnimatError, InvalidFile, first_line, out_of_memory
+from animat.errors import AnimatError, InvalidFile, as_invalid_file, first_line, out_of_memory
 from animat.execution.receipts import digest_of
 from animat.progress import Progress
 from animat.writing import write_whole
@@ -147,16 +147,17 @@ class _Notice:
     def update(self, done: float, total: float, note: str = "") -> None:
         for path in self._paths:
             # Losing a notice loses no work.
-            with suppress(OSError):
+            with suppress(InvalidFile):
                 report(path, (done / total, note if path == self._paths[0] else None))
 
 
 def report(path: Path, data: Any) -> None:
-    """Write data to a file for other processes (`reported`); raises OSError if it cannot be written."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    new = path.with_suffix(".new")
-    new.write_text(json.dumps(data))
-    new.replace(path)
+    """Write data to a file for other processes (`reported`); raises InvalidFile if it cannot be written."""
+    with as_invalid_file(path, "cannot be written"):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        new = path.with_suffix(".new")
+        new.write_text(json.dumps(data))
+        new.replace(path)
 
 
 def reported(path: Path) -> Any:

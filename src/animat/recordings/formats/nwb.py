@@ -111,6 +111,13 @@ class _ErrorKeepingFile(io.FileIO):
             self.error = error
         return len(data)
 
+    def readinto(self, buffer: Any) -> int:
+        # HDF5 reads what it wrote, and h5py hands it whatever is in the buffer: garbage, with which it may crash.
+        view = memoryview(buffer).cast("B")
+        n = super().readinto(view) or 0
+        view[n:] = bytes(len(view) - n)
+        return len(view)
+
     def truncate(self, size: int | None = None) -> int:
         try:
             return super().truncate(size)
