@@ -206,6 +206,17 @@ def test_a_file_that_another_program_wrote_in_the_meantime_is_kept(
     assert out.read_text() == "another program's"
 
 
+def test_what_nwb_cannot_hold_is_refused_with_the_file_s_name(tmp_path: Path) -> None:
+    path = rig_file("cl1", tmp_path)
+    with h5py.File(path, "r+") as file:
+        file.attrs["created_utc"] = "the first of May"
+    with pytest.raises(
+        InvalidFile, match=rf"^{path}: provenance\['recorded_at'\]: expected .*, got 'the first of May'"
+    ):
+        convert_recording(path, tmp_path / "out.nwb")
+    assert [file.name for file in tmp_path.iterdir()] == [path.name]
+
+
 @pytest.mark.parametrize("name", ["x.csv", "x", "x.nwb.gz"])
 def test_the_output_name_must_end_in_nwb(name: str, tmp_path: Path) -> None:
     with pytest.raises(InvalidArgument, match=r"^--out: expected a name ending in \.nwb, as NWB is written, got "):

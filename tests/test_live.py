@@ -434,6 +434,24 @@ def test_ctrl_c_keeps_recordings_and_policies_and_stops_the_culture(
 
 
 @pytest.mark.oracle
+def test_without_room_for_the_last_files_the_results_are_reported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write, said = shadowing._Run.write, list[str]()
+
+    def full(run: Any, what: str, **fields: Any) -> Any:
+        if what == "closed loop":
+            raise InvalidFile("live.log: cannot be written: No space left on device")
+        return write(run, what, **fields)
+
+    monkeypatch.setattr(shadowing._Run, "write", full)
+    with FakeCulture() as culture, pytest.raises(InvalidFile, match="No space") as raised:
+        live(ONE, culture, PROTOCOL, tmp_path / "live", timetable=QUICK, report=said.append)
+    assert "p0" in said[-1] and "random" in said[-1]
+    assert raised.value.__notes__[0].startswith(f"{tmp_path}/live/session: the session ended: all ")
+
+
+@pytest.mark.oracle
 def test_a_culture_that_fails_meanwhile_is_stopped_and_what_was_trained_is_kept(tmp_path: Path) -> None:
     def fail(culture: FakeCulture, observed: Observed) -> Observed:
         raise DeviceFailed("gone")

@@ -142,10 +142,17 @@ def live(
                     report=report,
                     **settings,
                 )
-            run.write("closed loop", **gap.session.to_dict())
-            # If the culture failed or hangs, its state may be inconsistent; that after its last recording is not.
-            if gap.session.ending.by not in ("culture", "hang"):
-                run.keep_state()
+            try:
+                run.write("closed loop", **gap.session.to_dict())
+                # If the culture failed or hangs, its state may be inconsistent; that after its last recording is not.
+                if gap.session.ending.by not in ("culture", "hang"):
+                    run.keep_state()
+            except InvalidFile as error:
+                # Without room for these files the results are not lost.
+                if report is not None:
+                    report(gap.to_text())
+                error.add_note(f"{run.folder / SESSION}: the session ended: {gap.session.ending.message}")
+                raise
         except BaseException as error:
             run.end_early(error)
             with suppress(InvalidFile):

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from animat.arguments import checked_arguments
-from animat.errors import InvalidArgument, InvalidFile
+from animat.errors import InvalidArgument, InvalidFile, in_file
 from animat.progress import Progress
 from animat.recordings.detection.settings import Detection
 from animat.recordings.findings import Finding, merged
@@ -152,7 +152,9 @@ def convert_recording(
     clear_leftovers(out.parent, glob.escape(out.name))
     # Another program may have written it in the meantime.
     _expect_new(out)
-    write_nwb(recording, out)
+    # It may hold what NWB cannot.
+    with in_file(path):
+        write_nwb(recording, out)
     return recording
 
 
