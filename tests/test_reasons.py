@@ -53,6 +53,7 @@ def session(
         np.zeros(1),
         CommandSums(everywhere, summed(recorded)[..., None]),
         CommandSums(everywhere + 0 * drawn[..., 0], anew[..., None]),
+        np.zeros((1, 2)),
     )
     pooled_hz = np.sort(recorded, axis=None)
     ranks = tuple(ranks_among(pooled_hz, x_hz)[:, None] for x_hz in recorded)

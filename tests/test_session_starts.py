@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any, ClassVar
 
 import jax
@@ -13,9 +14,11 @@ import pytest
 from animat.closed_loop.runner import runner_of, starts_of
 from animat.coding.mapping import Thresholds
 from animat.environment import Animat, WithoutNeurons
+from animat.evaluation.controls import Control
 from animat.evaluation.optimum import optimal_values
-from animat.evaluation.rollouts import Uniform, roll_out
+from animat.evaluation.rollouts import Constant, Uniform, roll_out
 from animat.neurons.synthetic import synthetic_simulator
+from animat.reality_gap.predicting import pool, predict_agents
 from animat.robots import Cartpole, Navigation, Robot, robot_named
 from animat.robots.base import Quantity, Transition
 from animat.robots.grid import Grid, grid_for
@@ -70,6 +73,38 @@ def test_bodies_outside_jax_start_where_those_of_a_session_will(episodes: int) -
     returns = roll_out(environment, None, Uniform(), episodes=episodes, seed=1, starts=starts).returns
     np.testing.assert_allclose(returns[0], -4 * np.abs(loop[np.arange(episodes) % 3]), rtol=1e-5)
     assert starts_of(robot, 5, 3) == starts
+
+
+@dataclass(frozen=True)
+class Lasting(Drawn):
+    """Lasts the longer, the further out it starts: one to four iterations."""
+
+    name: ClassVar[str] = "lasting"
+
+    def reset(self, key: Any) -> Any:
+        return jnp.stack([jax.random.uniform(key), jnp.float32(0)])
+
+    def advance(self, uniforms: Any, state: Any, u: Any) -> Transition[Any]:
+        return state + jnp.array([0.0, 1.0]), jnp.float32(1), state[1] >= jnp.floor(4 * state[0])
+
+    def observe(self, state: Any) -> Any:
+        return state[:1]
+
+
+def test_what_is_presented_is_predicted_from_each_start() -> None:
+    starts, simulator = Starts.of_session(5, 6), synthetic_simulator()
+    lasts = [1 + int(4 * Lasting().reset(key)[0]) for key in starts.of_episodes(6)]
+    assert len(set(lasts)) > 2
+    calibration: Any = SimpleNamespace(simulator=simulator, bootstraps=[simulator] * 2)
+    environment = Animat(Lasting(), Thresholds(1), 5)
+    policies = Control("policies", "", Constant(jnp.array([1, 3])))
+    predicted = predict_agents(policies, ("p0", "p1"), [], environment, calibration, starts=starts)
+    for name, condition in (("p0", 1), ("p1", 3)):
+        for number, n in enumerate(lasts):
+            assert predicted[name].of_start(number).presented.tolist() == [n * (i == condition) for i in range(5)]
+        assert predicted[name].presented[condition] == pytest.approx(np.mean(lasts))
+    both = pool([predicted["p0"].of_start(2), predicted["p1"].of_start(2)])
+    assert both.presented.tolist() == [0, lasts[2] / 2, 0, lasts[2] / 2, 0]
 
 
 def test_it_is_known_whether_starts_differ() -> None:

@@ -93,7 +93,7 @@ def write_random(folder: Path, spec: RobotSpec, arm: Arm, *minutes: float) -> No
 
 def episodes_of(returns: np.ndarray) -> Episodes:
     """Episodes of ten iterations each."""
-    none = np.zeros((len(returns), 0), np.int64)
+    none = np.zeros((*returns.shape, 0), np.int64)
     return Episodes(returns, np.full(returns.shape, 10), np.zeros(returns.shape, bool), none, none.astype(np.float64))
 
 

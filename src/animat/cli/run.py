@@ -148,6 +148,7 @@ class Run(StimulationOptions):
     def _policies(self) -> tuple[dict[str, Policy], Policy]:
         """The policies and the first of them, which represents all; refuses options that do not suit them."""
         from animat.closed_loop.running import check_episodes
+        from animat.evaluation.rollouts import check_seed
         from animat.reality_gap import check_policies
         from animat.robots.host import HostRobot
 
@@ -165,6 +166,7 @@ class Run(StimulationOptions):
         for option in (option for option, is_given in in_jax.items() if is_given):
             if isinstance(first.robot, HostRobot):
                 raise InvalidArgument(f"{option}: expected a robot in JAX, got {first.robot.name}; leave it out")
+            check_seed(self.seed)
         return policies, first
 
     def _calibration(self, recordings: Sequence[Recording], first: Policy, fit: dict[str, Any]) -> Calibration:

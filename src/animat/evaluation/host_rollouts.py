@@ -29,7 +29,7 @@ class Counts(NamedTuple):
     returns: np.ndarray
     lengths: np.ndarray
     terminated: np.ndarray
-    presented: np.ndarray
+    delivered: np.ndarray
     commanded: np.ndarray
 
 
@@ -50,9 +50,10 @@ def roll_out_on_host(
     episodes they have instead, as in `animat.evaluation.rollouts.roll_out`.
     """
     n_conditions = 0 if simulator is None or environment.n_actions is None else environment.n_actions
-    shape, presented = (len(keys), episodes), np.zeros((len(keys), n_conditions), np.int64)
-    commanded = np.zeros((*presented.shape, *environment.robot.command_shape))
-    counts = Counts(np.zeros(shape), np.zeros(shape, np.int64), np.zeros(shape, bool), presented, commanded)
+    shape = len(keys), episodes
+    commanded = np.zeros((len(keys), n_conditions, *environment.robot.command_shape))
+    delivered = np.zeros((*shape, n_conditions), np.int64)
+    counts = Counts(np.zeros(shape), np.zeros(shape, np.int64), np.zeros(shape, bool), delivered, commanded)
     side_by_side = min(AT_ONCE, episodes)
     actors_at_once = max(1, AT_ONCE // side_by_side)
     for begin in range(0, len(keys), actors_at_once):
@@ -66,8 +67,8 @@ def roll_out_on_host(
             if starts is not None:
                 seeds = starts.seeds_of(of_wave) * len(numbers)
             folded = jax.vmap(jax.random.fold_in, (0, None))(keys[some], first)
-            of_episodes = (each[some, first : first + side_by_side] for each in counts[:3])
-            wave = Counts(*of_episodes, *(each[some] for each in counts[3:]))
+            of_episodes = (each[some, first : first + side_by_side] for each in counts[:4])
+            wave = Counts(*of_episodes, *(each[some] for each in counts[4:]))
             _run_wave(environment, simulator, acting, folded, seeds, wave)
     return counts
 
@@ -106,8 +107,8 @@ def _run_wave(
     bodies.begin()
     n = counts.returns.shape[1]
     going = np.ones(counts.returns.shape, bool)
-    n_conditions = counts.presented.shape[1]
-    of_actor, commanded = np.indices(counts.returns.shape)[0], np.zeros_like(counts.commanded)
+    n_conditions = counts.delivered.shape[2]
+    commanded = np.zeros_like(counts.commanded)
     for command, delivered, stepped in _iterations(environment, simulator, actors, keys, bodies, n):
         of_bodies = stepped.reward, stepped.terminated, stepped.ended
         if (wrong := delivered[(delivered < 0) | (delivered >= n_conditions)]).size and n_conditions:
@@ -116,10 +117,11 @@ def _run_wave(
         counts.returns[:] += np.where(going, reward, 0.0)
         counts.lengths[:] += going
         counts.terminated[:] |= going & terminated
-        if counts.presented.size:
-            at = of_actor[going], delivered[:, :n][going]
-            np.add.at(counts.presented, at, 1)
-            np.add.at(commanded, at, command[:, :n][going])
+        if counts.delivered.size:
+            actor, episode = np.nonzero(going)
+            condition = delivered[:, :n][going]
+            np.add.at(counts.delivered, (actor, episode, condition), 1)
+            np.add.at(commanded, (actor, condition), command[:, :n][going])
         going &= ~ended
     counts.commanded[:] += commanded
 

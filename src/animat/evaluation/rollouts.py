@@ -141,8 +141,8 @@ class Episodes:
     Attributes:
         returns: sum of rewards of each episode, in the task's own units.
         terminated: whether it ended by itself and not at the episode limit.
-        presented: how often each condition was delivered, in all episodes together; no conditions without neurons.
-        commanded: the sum of the commands that each condition led to; several commands separately.
+        delivered: how often each condition was delivered in each episode; no conditions without neurons.
+        commanded: the sum of the commands that each condition led to in all episodes; several commands separately.
         outcome: of each episode, for a robot with a goal; shape (actors, episodes), and with a last axis of objectives.
     """
 
@@ -151,9 +151,14 @@ class Episodes:
     returns: Float64[np.ndarray, "actors episodes"]
     lengths: Int64[np.ndarray, "actors episodes"]
     terminated: Bool[np.ndarray, "actors episodes"]
-    presented: Int64[np.ndarray, "actors conditions"]
+    delivered: Int64[np.ndarray, "actors episodes conditions"]
     commanded: Float64[np.ndarray, "actors conditions *commands"]
     outcome: Outcome | None = None
+
+    @property
+    def presented(self) -> Int64[np.ndarray, "actors conditions"]:
+        """How often each condition was delivered, in all episodes together."""
+        return np.asarray(self.delivered.sum(axis=1))
 
     @property
     def half_way(self) -> int:
@@ -222,8 +227,8 @@ def roll_out(
         ran = _roll_out(environment, episodes, simulator, actors, keys, of_episodes)
     *counted, terminated, outcome = jax.device_get(ran)
     kinds = (np.float64, np.int64, np.int64, np.float64)
-    returns, lengths, presented, commanded = (x.astype(kind) for x, kind in zip(counted, kinds, strict=True))
-    return Episodes(returns, lengths, terminated, presented, commanded, outcome)
+    returns, lengths, delivered, commanded = (x.astype(kind) for x, kind in zip(counted, kinds, strict=True))
+    return Episodes(returns, lengths, terminated, delivered, commanded, outcome)
 
 
 class _Course(NamedTuple):
@@ -233,7 +238,7 @@ class _Course(NamedTuple):
     going: Bool[Array, " episodes"]
     returns: Float[Array, " episodes"]
     lengths: Int[Array, " episodes"]
-    presented: Int[Array, " conditions"]
+    delivered: Int[Array, "episodes conditions"]
     commanded: Float[Array, "conditions *commands"]
     terminated: Bool[Array, " episodes"]
 
@@ -249,7 +254,7 @@ def _begin(
         jnp.ones(episodes, bool),
         jnp.zeros(episodes),
         jnp.zeros(episodes, jnp.int32),
-        jnp.zeros(n_conditions, jnp.int32),
+        jnp.zeros((episodes, n_conditions), jnp.int32),
         jnp.zeros((n_conditions, *environment.robot.command_shape)),
         jnp.zeros(episodes, bool),
     )
@@ -259,17 +264,17 @@ def _begin(
 def _advance(
     environment: Environment[Any], simulator: Neurons, course: _Course, action: Array, noise: Array
 ) -> _Course:
-    state, going, returns, lengths, presented, commanded, terminated = course
+    state, going, returns, lengths, delivered, commanded, terminated = course
     after = jax.vmap(environment.advance, (0, 0, 0, None))(noise, state, action, simulator)
     returns = returns + jnp.where(going, after.reward, 0.0)
     terminated = terminated | (going & after.ended.terminated)
     lengths = lengths + going
     if simulator is not None:
-        delivered = going[:, None] & (after.info["delivered"][:, None] == jnp.arange(len(presented)))
-        presented = presented + delivered.sum(axis=0, dtype=jnp.int32)
-        commanded = commanded + jnp.tensordot(delivered.T.astype(jnp.float32), after.info["command"], 1)
+        now = going[:, None] & (after.info["delivered"][:, None] == jnp.arange(delivered.shape[1]))
+        delivered = delivered + now
+        commanded = commanded + jnp.tensordot(now.T.astype(jnp.float32), after.info["command"], 1)
     going = going & ~jnp.logical_or(*after.ended)
-    return _Course(after.carried, going, returns, lengths, presented, commanded, terminated)
+    return _Course(after.carried, going, returns, lengths, delivered, commanded, terminated)
 
 
 def _results(environment: Environment[Any], course: _Course) -> tuple[Any, ...]:
@@ -352,7 +357,8 @@ class Trajectories(NamedTuple):
 def trajectories(
     environment: Environment[Any], simulator: Neurons, actors: Actor, *, episodes: int, seed: int
 ) -> Trajectories:
-    """Run episodes of each actor on a robot in JAX; arguments as in `roll_out`."""
+    """Run episodes of each actor on a robot in JAX; arguments and errors as in `roll_out`."""
+    check_seed(seed)
     n_actors = actors.n_actors
     keys = jax.random.split(jax.random.key(seed), n_actors * episodes).reshape(n_actors, episodes)
     return jax.device_get(_trajectories(environment, simulator, actors, keys))  # type: ignore[no-any-return]

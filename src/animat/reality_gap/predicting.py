@@ -48,12 +48,15 @@ class AgentPrediction(NamedTuple):
         bootstrap_means: its mean return on each bootstrap simulator, from each start; their spread is due to the
             recording's responses and, a little, to the episodes.
         commanded: in all its episodes on the recording's simulator; `commanded_bootstraps`: on each bootstrap one.
+        delivered: how often each condition is delivered in an episode from each start, on average, on the recording's
+            simulator.
     """
 
     returns: Float64[np.ndarray, "starts episodes"]
     bootstrap_means: Float64[np.ndarray, "bootstraps starts"]
     commanded: CommandSums
     commanded_bootstraps: CommandSums
+    delivered: Float64[np.ndarray, "starts conditions"]
 
     @property
     def interval(self) -> Interval:
@@ -62,13 +65,14 @@ class AgentPrediction(NamedTuple):
 
     @property
     def presented(self) -> Float64[np.ndarray, " conditions"]:
-        """How often each condition is presented in an episode, on average."""
-        return np.asarray(self.commanded.presented / self.returns.size)
+        """How often each condition is presented in an episode, on average over the starts."""
+        return np.asarray(self.delivered.mean(axis=0))
 
     def of_start(self, number: int) -> AgentPrediction:
         """The prediction from one of the starts; its commands are still those from all starts."""
         one = slice(number, number + 1)
-        return self._replace(returns=self.returns[one], bootstrap_means=self.bootstrap_means[:, one])
+        means = self.bootstrap_means[:, one]
+        return self._replace(returns=self.returns[one], bootstrap_means=means, delivered=self.delivered[one])
 
 
 def pool(predicted: Sequence[AgentPrediction]) -> AgentPrediction:
@@ -78,6 +82,7 @@ def pool(predicted: Sequence[AgentPrediction]) -> AgentPrediction:
         np.mean([each.bootstrap_means for each in predicted], axis=0),
         _added([each.commanded for each in predicted]),
         _added([each.commanded_bootstraps for each in predicted]),
+        np.mean([each.delivered for each in predicted], axis=0),
     )
 
 
@@ -140,12 +145,14 @@ def predict_agents(
             for name, of in rows.items():
                 # The first `ROLL_OUTS` are on the recording's simulator, each later one on a bootstrap of it.
                 from_starts = returns[:, of].reshape(len(ran), -1, rounds)
+                delivered = np.array([each.delivered[of] for each in ran[:ROLL_OUTS]])
                 commanded = CommandSums(presented[:, of], total[:, of]).summed(1)
                 predictions[name] = AgentPrediction(
                     from_starts[:ROLL_OUTS].reshape(-1, rounds).T,
                     from_starts[ROLL_OUTS:].mean(axis=1),
                     CommandSums(*(sums[:ROLL_OUTS] for sums in commanded)).summed(0),
                     CommandSums(*(sums[ROLL_OUTS:] for sums in commanded)),
+                    delivered.reshape(-1, rounds, delivered.shape[-1]).mean(axis=0),
                 )
     return predictions
 

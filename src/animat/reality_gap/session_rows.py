@@ -55,7 +55,7 @@ def session_rows(
                 from_measured = pool([predicted[each.agent].of_start(turn_of[each.number]) for each in whole])
                 expected = from_measured.returns.reshape(len(whole), -1).mean(axis=1)
         if of_trials is not None:
-            predicted_pulses = float(from_all.presented @ of_trials) * (name not in unstimulated)
+            predicted_pulses = float(from_measured.presented @ of_trials) * (name not in unstimulated)
         met = [goal_outcomes[episode.number] for episode in episodes if episode.number in goal_outcomes]
         return Row(
             name=name,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Self
@@ -18,11 +19,13 @@ from animat.evaluation.controls import Control, controls_of, interventions_of
 from animat.evaluation.rollouts import Networks, networks_of
 from animat.neurons.simulator import NeuronSimulator
 from animat.reality_gap.calibration import Calibration
-from animat.reality_gap.table import INTERVENTION_EPISODES
 from animat.robots.host import HostRobot
 from animat.robots.starts import Starts
 from animat.training.policy import Policy
 from animat.wrappers import NeuralObservation
+
+INTERVENTION_EPISODES = 100
+"""Fewest episodes of each policy on the simulator, with an ideal actuator and for the median length of an episode."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +71,10 @@ class Simulation:
         if isinstance(robot := self.environment.robot, HostRobot):
             got = f"{robot.name}, which is stepped outside JAX"
             raise InvalidArgument(f"--interventions: expected a robot in JAX, got {got}")
-        simulated: dict[str, Any] = {"episodes": INTERVENTION_EPISODES, "seed": self.seed, "starts": self.starts}
+        rounds = 1 if self.starts is None else self.starts.rounds
+        # From each start equally many.
+        episodes = rounds * math.ceil(INTERVENTION_EPISODES / rounds)
+        simulated: dict[str, Any] = {"episodes": episodes, "seed": self.seed, "starts": self.starts}
         half_way = self.trained.run(*self.within, **simulated).half_way
         actuator, *changed = interventions_of(*self.within, self.networks, switch_at=half_way)
         returns = actuator.run(*self.within, **simulated).returns.ravel()

@@ -33,8 +33,6 @@ LARGE_SHARE = 0.1
 
 INTERVENTIONS = ("random spikes", "silent", "shuffled", "yoked", "turned round", "goal switched")
 """Interventions that are measured, in the order of the table."""
-INTERVENTION_EPISODES = 100
-"""Episodes of each policy on the simulator, with an ideal actuator and for the median length of an episode."""
 
 
 @dataclass(frozen=True)
