@@ -17,7 +17,7 @@ from animat.writing import expect_writable
 
 @dataclass(frozen=True)
 class ClusterCommand(Command):
-    """A Dask scheduler and workers, for --cluster of train, study, reproduce and tune; until Ctrl-C."""
+    """Run a Dask scheduler and workers until Ctrl-C, for --cluster of train, study, reproduce and tune."""
 
     where: Positional[Literal["local"]]
     """local: on this machine, to try it out; docs/cluster.md has the few lines for several machines"""

@@ -94,7 +94,7 @@ class StimulationOptions(FolderCommand):
     selection: Path | None = None
     """For a MaxOne: the file of its electrodes"""
     culture_seed: int | None = None
-    """Which virtual culture, patterns of a CL1 or draws of a replay; default: in run that of the recordings, else 1"""
+    """Seed of the virtual culture, a CL1's patterns or a replay's draws; default: in run the recordings', else 1"""
     budget_pulses: int | None = None
     """Most pulses in all, in live including those of the recordings; default: no limit but the culture's own"""
     budget_per_electrode: int | None = None

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Inspect(ResponseOptions):
-    """Report what is in recordings, whether an Animat can be made from them, and what is wrong with them."""
+    """Report what is in recordings, whether a robot can be driven with them, and what is wrong with them."""
 
     recordings: Positional[tuple[Path, ...]] = ()
     """Files, or folders of them: NWB, MaxWell, CL1, NPZ, CSV (NAME_spikes.csv with NAME_stimuli.csv)"""

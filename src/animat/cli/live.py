@@ -40,8 +40,8 @@ class Live(StimulationOptions):
     trials: int | None = None
     """Trials of each frequency in a recording; default: 500"""
     protocol: Path | None = None
-    """A JSON file that replaces these three, as for animat record, such as {"frequencies_hz": [5, 10, 20, 40]}; what it
-    leaves out has its default"""
+    """A JSON file in place of --order, --pulses and --trials, as for animat record, such as
+    {"frequencies_hz": [5, 10, 20, 40]}; what it leaves out has its default"""
     interval_min: float = 10.0
     """Minutes of the culture's clock from one recording to the next"""
     duration_min: float = 60.0

@@ -51,8 +51,8 @@ class Record(FolderCommand):
     electrodes, [[1, 2], [3, 4]]: each place at each frequency is then a condition with that many trials; default: all
     of the culture's patterns at each frequency"""
     protocol: Path | None = None
-    """A JSON file that replaces these options, as Protocol.to_json writes it, with frequencies, times and pulse too;
-    what it leaves out has its default"""
+    """A JSON file, as Protocol.to_json writes it, in place of --paper, --order, --pulses, --trials and --places. It
+    also sets frequencies, times and pulse; what it leaves out has its default"""
     out: Path = Path("recordings")
     """Folder for the files"""
 

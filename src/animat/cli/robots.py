@@ -12,7 +12,7 @@ from animat.cli.command import Command, robot_for
 
 @dataclass(frozen=True)
 class Robots(Command):
-    """List the robots that can be trained: what each observes, its parameters, and what it can do."""
+    """List the robots that can be trained: what each observes, its parameters, and what it lacks."""
 
     names: Positional[tuple[str, ...]] = ()
     """Robots to list, such as cartpole or my_package.robots:Rover; default: all registered robots"""

@@ -52,8 +52,8 @@ class Train(SimulatorOptions, JobOptions):
     policies: int | None = None
     """Number of policies, each with its own random numbers; default: 4, with --paper 10"""
     iterations: int | None = None
-    """Training iterations of each policy; default: 400000 for cartpole, 500000 for swing-up, 1000000 for arm, 250000
-    for others, with --paper twice as many"""
+    """Training iterations of each policy; default: 400000 for cartpole, 500000 for swing-up, 1000000 for arm and
+    detour, 250000 for others, with --paper twice as many"""
     seed: int = 1
     """Decides every random draw"""
     shadowing: Literal["on", "off", "drawn"] = "on"

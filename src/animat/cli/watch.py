@@ -14,7 +14,7 @@ from animat.errors import InvalidArgument
 
 @dataclass(frozen=True)
 class Watch(Command):
-    """Serve a page of what runs, ran or was killed in a folder, for a browser on this machine, until Ctrl-C."""
+    """Serve a page of all work in a folder (running, finished or killed) to a browser on this machine, until Ctrl-C."""
 
     folder: Positional[Path]
     """Folder of a session, a training, a live run, a study, a tuning, recordings, or several of these"""

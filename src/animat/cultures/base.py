@@ -103,7 +103,7 @@ class Culture(Openable):
 
     @property
     def left_out(self) -> dict[str, int]:
-        """Counts since `open` of what the device reported, or should have, and recordings lack, by description."""
+        """Counts since `open`, by description, of what recordings lack but the device reported or should have."""
         return {}
 
     @property

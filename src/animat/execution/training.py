@@ -76,7 +76,7 @@ def train(
         with all assessments in `assessments.csv`.
 
     Raises:
-        InvalidArgument: for a training that cannot be trained, with these simulators, workers or executor.
+        InvalidArgument: for a training that is impossible with these simulators, workers or executor.
         Mismatch: if the folder holds another training or other work, or another run is active in it.
         InvalidFile: if a file cannot be read or written.
         UnusableData: if what was learned is no longer finite; none of it is left in the folder.

@@ -107,5 +107,5 @@ def check_plan(
     if folder.exists() and any(file.name != LOCK for file in folder.iterdir()):
         left = (folder / RECORDINGS / UNDER_WAY).exists()
         see = f"animat {'recover' if left else 'watch'} {folder}"
-        remedy = f"choose another, or {'keep what was recorded' if left else 'see what it holds'}: {see}"
+        remedy = f"choose another, or {'keep what a device had recorded' if left else 'see what it holds'}: {see}"
         raise Mismatch(f"{folder}: expected an empty folder for a live run, got one with files; {remedy}")

@@ -132,10 +132,9 @@ def fit_memory(responses: Responses, *, room: int | None = None, memory: Memory 
     If all conditions have one frequency, another twenty forms with weights below 0 are tried. If one of these is the
     best, decay and weight are those with which regressions of each condition's ranks on the trace explain most.
 
-    The decay is from 0 to 0.45, the weight from 0 to 4, with weights from -1 to below 0 the decay up to 0.6, the
-    exponent from 0.5 to 0.9. How strongly the responses to a
-    condition depend on trace and load, a slope for each, is moved towards the slopes of all conditions together, the
-    less certain it is (empirical Bayes).
+    The weight is from 0 to 4 and the decay from 0 to 0.45; with weights from -1 to below 0 the decay is up to 0.6. The
+    exponent is from 0.5 to 0.9. How strongly the responses to a condition depend on trace and load, a slope for each,
+    is moved towards the slopes of all conditions together, the more so the less certain it is (empirical Bayes).
 
     Args:
         responses: of one recording, every condition with at least one non-burst response. Those after a burst, which
