@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +18,7 @@ from animat.errors import InvalidArgument, InvalidFile
 from animat.recordings.conversion import Origin, convert_recording
 from animat.recordings.detection.settings import Detection
 from animat.recordings.formats import with_spikeinterface
+from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
 from rig_files import event_table, mapping_table, spike_table, write_cl1, write_maxwell
@@ -204,6 +207,30 @@ def test_a_file_that_another_program_wrote_in_the_meantime_is_kept(
     with pytest.raises(InvalidArgument, match="--out: expected a new file, got"):
         convert_recording(path, out)
     assert out.read_text() == "another program's"
+
+
+@pytest.mark.parametrize("has_links", [True, False])
+def test_a_file_that_another_program_wrote_during_the_last_step_is_kept(
+    has_links: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, out = rig_file("npz", tmp_path), tmp_path / "out.nwb"
+
+    def write(recording: Recording, beside: Path) -> None:
+        write_nwb(recording, beside)
+        out.write_text("another program's")
+
+    def no_links(*_: object) -> None:
+        raise OSError(errno.ENOTSUP, os.strerror(errno.ENOTSUP))
+
+    monkeypatch.setattr("animat.recordings.conversion.write_nwb", write)
+    if not has_links:
+        monkeypatch.setattr(os, "link", no_links)
+    with pytest.raises(InvalidFile, match=r"out\.nwb: cannot be written: File exists; any"):
+        convert_recording(path, out)
+    assert out.read_text() == "another program's" and {*tmp_path.iterdir()} == {path, out}
+    out.unlink()
+    monkeypatch.setattr("animat.recordings.conversion.write_nwb", write_nwb)
+    assert convert_recording(path, out).equals(read_recording(out)) and {*tmp_path.iterdir()} == {path, out}
 
 
 def test_what_nwb_cannot_hold_is_refused_with_the_file_s_name(tmp_path: Path) -> None:

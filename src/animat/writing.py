@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import os
 import re
@@ -22,11 +23,12 @@ _UNFINISHED = re.compile(r"\..+\.[a-z0-9_]{8}\.partial(\.[^.]*)?")
 
 
 @contextmanager
-def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
+def atomic_write(path: str | os.PathLike[str], *, replaces: bool = True) -> Iterator[Path]:
     """Yield a temporary path next to `path`; on success rename it to `path`, on any error remove it.
 
     An existing file at `path` stays intact until the new one is complete and on disk, even if the disk fills up or the
-    process is killed. Missing parent folders are created. Raises InvalidFile if the file cannot be written.
+    process is killed. Missing parent folders are created. Raises InvalidFile if the file cannot be written or, unless
+    it `replaces` one, if there is a file at `path` by then.
     """
     path = Path(path)
     with as_invalid_file(path, "cannot be written"):
@@ -39,11 +41,29 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
             yield temporary
             with temporary.open("rb") as file:
                 os.fsync(file.fileno())
-            temporary.replace(path)
+            if replaces:
+                temporary.replace(path)
+            else:
+                _become_new(temporary, path)
             sync_folder(path.parent)
         except BaseException:
             temporary.unlink(missing_ok=True)
             raise
+
+
+def _become_new(temporary: Path, path: Path) -> None:
+    """Rename a file, unless there is one at `path` (FileExistsError)."""
+    try:
+        os.link(temporary, path)
+    except FileExistsError:
+        raise
+    except OSError as error:
+        # Some file systems have no hard links.
+        if path.exists():
+            raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST)) from error
+        temporary.replace(path)
+    else:
+        temporary.unlink()
 
 
 def write_whole(path: Path, content: str | bytes) -> Path:
