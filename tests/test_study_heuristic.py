@@ -55,4 +55,6 @@ def test_policies_that_do_not_outperform_the_heuristic_are_named() -> None:
 def episodes_of(returns: np.ndarray) -> Episodes:
     """Episodes of a hundred iterations each."""
     none = np.zeros((*returns.shape, 0), np.int64)
-    return Episodes(returns, np.full(returns.shape, 100), np.zeros(returns.shape, bool), none, none.astype(np.float64))
+    return Episodes(
+        returns, np.full(returns.shape, 100), np.zeros(returns.shape, bool), none, none[:, 0].astype(np.float64)
+    )

@@ -94,7 +94,9 @@ def write_random(folder: Path, spec: RobotSpec, arm: Arm, *minutes: float) -> No
 def episodes_of(returns: np.ndarray) -> Episodes:
     """Episodes of ten iterations each."""
     none = np.zeros((*returns.shape, 0), np.int64)
-    return Episodes(returns, np.full(returns.shape, 10), np.zeros(returns.shape, bool), none, none.astype(np.float64))
+    return Episodes(
+        returns, np.full(returns.shape, 10), np.zeros(returns.shape, bool), none, none[:, 0].astype(np.float64)
+    )
 
 
 def test_the_table_of_episodes_has_a_row_for_each(tmp_path: Path) -> None:
