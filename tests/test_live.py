@@ -48,6 +48,7 @@ from animat.stimulation.stimulus import Stimulus
 from animat.training.policy import load_policies
 from animat.training.settings import SAC
 from animat.training.specification import Training
+from animat.watch.discovery import is_locked
 from animat.watch.live import LiveView
 from animat.watch.recording import RecordingView
 from animat.writing import exclusive_lock
@@ -88,7 +89,13 @@ def seen() -> Seen:
 
 
 @pytest.fixture(scope="module")
-def ran(tmp_path_factory: pytest.TempPathFactory, seen: Seen) -> tuple[LiveRun, Path, int]:
+def trained() -> list[bool | None]:
+    """Whether viewers could tell that policies were being trained, whenever a recording under way was seen."""
+    return []
+
+
+@pytest.fixture(scope="module")
+def ran(tmp_path_factory: pytest.TempPathFactory, seen: Seen, trained: list[bool | None]) -> tuple[LiveRun, Path, int]:
     """A run whose recordings are watched as they are made."""
     folder = tmp_path_factory.mktemp("live") / "live"
 
@@ -98,6 +105,7 @@ def ran(tmp_path_factory: pytest.TempPathFactory, seen: Seen) -> tuple[LiveRun, 
             found = RecordingView(folder / "recordings").view(None, 8.0)
             facts = dict(found["blocks"][0]["rows"])
             seen.append((found["state"], facts["complete"], facts["shown"], found["end_s"]))
+            trained.append(is_locked(folder / "policies"))
 
     with pytest.MonkeyPatch.context() as patch, FakeCulture() as culture:
         patch.setattr(under_way, "EVERY_S", 0.0)
@@ -116,8 +124,11 @@ def test_the_culture_is_recorded_every_interval(ran: tuple[LiveRun, Path, int]) 
     assert found.culture_min == pytest.approx(30.0)
 
 
-def test_recordings_are_watched_as_they_are_made(ran: tuple[LiveRun, Path, int], seen: Seen) -> None:
+def test_recordings_are_watched_as_they_are_made(
+    ran: tuple[LiveRun, Path, int], seen: Seen, trained: list[bool | None]
+) -> None:
     found, folder = ran[0], ran[1] / "recordings"
+    assert trained == [whole > 0 for _, whole, *_ in seen]
     assert {state for state, *_ in seen} == {"running"}
     assert {shown for *_, shown, _ in seen} == {"the one in progress, as far as it has come"}
     for number, file in enumerate(found.recordings):
@@ -155,9 +166,14 @@ def test_what_has_happened_is_watched(ran: tuple[LiveRun, Path, int]) -> None:
 
 def test_a_live_run_is_watched_until_it_is_killed(ran: tuple[LiveRun, Path, int], tmp_path: Path) -> None:
     whole = (ran[1] / LOG_FILE).read_text().splitlines(keepends=True)
-    for n, message in ((1, "the first recording is made"), (5, "training"), (9, "training has ended")):
+    for n, message, held in (
+        (1, "the first recording is made", "recordings"),
+        (5, "training", "policies"),
+        (7, "training", ""),
+        (9, "training has ended", "session"),
+    ):
         (tmp_path / LOG_FILE).write_text("".join(whole[:n]))
-        with exclusive_lock(tmp_path):
+        with exclusive_lock(tmp_path / held):
             shown = LiveView(tmp_path).view(None, 8.0)
             assert shown["state"] == "running" and shown["message"].startswith(message)
         killed = LiveView(tmp_path).view(None, 8.0)

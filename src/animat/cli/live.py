@@ -13,6 +13,7 @@ from tyro.conf import Positional
 
 from animat.cli.command import StimulationOptions, expect_no_fault, read_sac, robot_for
 from animat.errors import InvalidArgument, counted
+from animat.writing import exclusive_lock
 
 if TYPE_CHECKING:
     from animat.live.shadowing import LiveRun
@@ -94,6 +95,7 @@ class Live(StimulationOptions):
         seed = 1 if self.culture_seed is None else self.culture_seed
         with (
             ExitStack() as stack,
+            exclusive_lock(self.out),
             Bar("culture") as progress,
             culture_named(
                 self.culture, seed=seed, recordings=recordings, selection=self.selection, progress=progress

@@ -115,55 +115,54 @@ def live(
     timetable = timetable or Timetable()
     account = account or Account()
     check_plan(training, protocol, Path(folder), timetable, episodes, settings, account)
-    with exclusive_lock(folder):
-        schedule = culture.schedule(protocol, order_seed(training.seed, 0))
-        with for_the_first_recording():
-            account.check([stimulus for block in schedule.blocks for stimulus in schedule.deliveries(block)])
-        if report is not None:
-            report(f"each pulse: {protocol.pulse}")
-        training = replace(training, duration_min=timetable.duration_min, shadowing=True)
-        run = _Run(training, culture, protocol, Path(folder), timetable, kind, account)
+    schedule = culture.schedule(protocol, order_seed(training.seed, 0))
+    with for_the_first_recording():
+        account.check([stimulus for block in schedule.blocks for stimulus in schedule.deliveries(block)])
+    if report is not None:
+        report(f"each pulse: {protocol.pulse}")
+    training = replace(training, duration_min=timetable.duration_min, shadowing=True)
+    run = _Run(training, culture, protocol, Path(folder), timetable, kind, account)
+    try:
+        policies = run.shadow(progress)
+        first, at_min = next(iter(policies.values())), run.used[-1].start_min
+        calibration = Calibration.of_series(run.used, first, at_min=at_min, adaptive=adaptive, kind=kind)
+        # The session has its own lock, by which viewers see that it is running.
+        with exclusive_lock(run.folder / SESSION):
+            gap = run_policies(
+                policies,
+                culture,
+                calibration,
+                run.folder / SESSION,
+                episodes=episodes,
+                with_controls=with_controls,
+                seed=training.seed,
+                account=run.account,
+                progress=progress,
+                report=report,
+                **settings,
+            )
         try:
-            policies = run.shadow(progress)
-            first, at_min = next(iter(policies.values())), run.used[-1].start_min
-            calibration = Calibration.of_series(run.used, first, at_min=at_min, adaptive=adaptive, kind=kind)
-            # The session has its own lock, by which viewers see that it is running.
-            with exclusive_lock(run.folder / SESSION):
-                gap = run_policies(
-                    policies,
-                    culture,
-                    calibration,
-                    run.folder / SESSION,
-                    episodes=episodes,
-                    with_controls=with_controls,
-                    seed=training.seed,
-                    account=run.account,
-                    progress=progress,
-                    report=report,
-                    **settings,
-                )
-            try:
-                run.write("closed loop", **gap.session.to_dict())
-                # If the culture failed or hangs, its state may be inconsistent; that after its last recording is not.
-                if gap.session.ending.by not in ("culture", "hang"):
-                    run.keep_state()
-            except InvalidFile as error:
-                # Without room for these files the results are not lost.
-                if report is not None:
-                    report(gap.to_text())
-                error.add_note(f"{run.folder / SESSION}: the session ended: {gap.session.ending.message}")
-                raise
-        except BaseException as error:
-            run.end_early(error)
-            with suppress(InvalidFile):
-                run.write("end", budget=run.account.to_dict())
-            if any((run.folder / POLICIES).glob("p*.safetensors")):
-                of = str(run.folder / POLICIES), "--recordings", str(run.folder / RECORDINGS)
-                command = shlex.join(("animat", "run", *of))
-                error.add_note(f"what was trained so far can still be run: {command}")
+            run.write("closed loop", **gap.session.to_dict())
+            # If the culture failed or hangs, its state may be inconsistent; that after its last recording is not.
+            if gap.session.ending.by not in ("culture", "hang"):
+                run.keep_state()
+        except InvalidFile as error:
+            # Without room for these files the results are not lost.
+            if report is not None:
+                report(gap.to_text())
+            error.add_note(f"{run.folder / SESSION}: the session ended: {gap.session.ending.message}")
             raise
-        run.write("end", budget=run.account.to_dict())
-        return LiveRun(tuple(run.files), policies, tuple(run.swaps), run.iterations, run.culture_min, run.wall_s, gap)
+    except BaseException as error:
+        run.end_early(error)
+        with suppress(InvalidFile):
+            run.write("end", budget=run.account.to_dict())
+        if any((run.folder / POLICIES).glob("p*.safetensors")):
+            of = str(run.folder / POLICIES), "--recordings", str(run.folder / RECORDINGS)
+            command = shlex.join(("animat", "run", *of))
+            error.add_note(f"what was trained so far can still be run: {command}")
+        raise
+    run.write("end", budget=run.account.to_dict())
+    return LiveRun(tuple(run.files), policies, tuple(run.swaps), run.iterations, run.culture_min, run.wall_s, gap)
 
 
 @dataclass(eq=False)
@@ -200,7 +199,8 @@ class _Run:
         groups = groups_of(self.training, timeline, describe_training(self.training, timeline))
         minutes, policies = self.timetable.duration_min, self.folder / POLICIES
         progress = in_phase(progress, "training", minutes, "min of the culture")
-        with Trainers(groups, self.folder / _EXCHANGE, policies) as trainers:
+        # Locked, as the recordings and the session are in their turn, so that viewers know that it is running.
+        with exclusive_lock(policies), Trainers(groups, self.folder / _EXCHANGE, policies) as trainers:
             self.write("training", policies=self.training.policies, processes=len(groups))
             try:
                 self._record_on_schedule(trainers, progress)

@@ -6,8 +6,8 @@ import json
 from typing import Any
 
 from animat.errors import InvalidFile
-from animat.live.plan import POLICIES
-from animat.watch.discovery import state_of
+from animat.live.plan import POLICIES, RECORDINGS, SESSION
+from animat.watch.discovery import is_locked, state_of
 from animat.watch.files import listed, mapped, number, text, text_of
 from animat.watch.learning import Curves, curve_of_policy, learning_charts
 from animat.watch.view import View, facts, in_blocks, settings, short, table
@@ -64,7 +64,9 @@ class LiveView(View):
     def _state(self, events: list[Event]) -> dict[str, Any]:
         """The state of the run; how it ended is the message of the event before its end."""
         names = [event["what"] for event in events]
-        state = state_of(self.folder, is_done=names[-1] == "end")
+        # The command locks the whole folder, a run from Python what it writes to.
+        parts = self.folder, *(self.folder / part for part in (RECORDINGS, POLICIES, SESSION))
+        state = state_of(next(filter(is_locked, parts), self.folder), is_done=names[-1] == "end")
         if state["state"] == "ended":
             why = [event for event in events if event["what"] in ("fault", "interrupted", "closed loop")]
             return state | {"message": _details(why[-1]) if why else ""}
