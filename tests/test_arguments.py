@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import json
 import subprocess
 import sys
 from dataclasses import fields
@@ -16,6 +17,7 @@ import animat
 from animat.closed_loop.loop import Loop
 from animat.coding.encoder import Encoder
 from synthetic_recordings import synthetic_recording
+from test_closed_loop import loop_of
 
 FUNCTIONS = [name for name in animat.__all__ if inspect.isfunction(getattr(animat, name)) and name != "paper_study"]
 
@@ -31,6 +33,16 @@ def test_every_public_function_names_an_argument_of_the_wrong_kind(name: str) ->
     first = {"conditions_named": "conditions", "register_robot": "robot", "register_mapping": "mapping"}
     assert str(raised.value).startswith((f"{first.get(name, required[0])}: expected ", "recordings: expected "))
     assert "\n" not in str(raised.value)
+
+
+def test_numbers_from_numpy_are_saved_as_python_s() -> None:
+    """JSON does not know them, and a training would fail only when its policies are saved."""
+    responses = animat.extract_responses(synthetic_recording(1, patterns=3, channels=16), burst_threshold=np.float32(1))
+    timeline = animat.fit_timeline([responses], kind="histogram", bins=np.int64(20), range_hz=np.float32(120))
+    fitted = json.loads(json.dumps(timeline.fitted))
+    assert (fitted["bins"], fitted["range_hz"], fitted["burst_threshold"]) == (20, 120, 1)
+    loop = loop_of(pulses=np.int64(2), pause_s=np.float32(0.5), window_ms=(np.float32(2), np.float32(8)))
+    assert json.loads(json.dumps(loop.to_dict()))["pause_s"] == 0.5
 
 
 def test_lists_and_dictionaries_are_checked_inside_and_unions_said_in_full(tmp_path: Path) -> None:

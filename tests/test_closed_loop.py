@@ -629,6 +629,8 @@ def test_a_loop_presents_as_the_policy_was_recorded_and_names_where_it_does_not(
         ({"patience_s": float("nan")}, "patience_s"),
         ({"patience_s": 0.0}, "patience_s"),
         ({"patterns": 0}, "patterns"),
+        ({"pulse": None}, "pulse: expected a pulse, such as animat.BALANCED_PULSE, got None"),
+        ({"real_time": "off"}, "real_time: expected True or False, got 'off'"),
     ],
 )
 def test_settings_that_cannot_be_are_refused(wrong: dict[str, Any], words: str) -> None:

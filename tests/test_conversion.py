@@ -18,7 +18,7 @@ from animat.errors import InvalidArgument, InvalidFile
 from animat.recordings.conversion import Origin, convert_recording
 from animat.recordings.detection.settings import Detection
 from animat.recordings.formats import with_spikeinterface
-from animat.recordings.formats.nwb import write_nwb
+from animat.recordings.formats.nwb_tables import nwb_file
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
 from rig_files import event_table, mapping_table, spike_table, write_cl1, write_maxwell
@@ -215,21 +215,21 @@ def test_a_file_that_another_program_wrote_during_the_last_step_is_kept(
 ) -> None:
     path, out = rig_file("npz", tmp_path), tmp_path / "out.nwb"
 
-    def write(recording: Recording, beside: Path) -> None:
-        write_nwb(recording, beside)
+    def write(recording: Recording, of_channels: Any) -> Any:
         out.write_text("another program's")
+        return nwb_file(recording, of_channels)
 
     def no_links(*_: object) -> None:
         raise OSError(errno.ENOTSUP, os.strerror(errno.ENOTSUP))
 
-    monkeypatch.setattr("animat.recordings.conversion.write_nwb", write)
+    monkeypatch.setattr("animat.recordings.formats.nwb_tables.nwb_file", write)
     if not has_links:
         monkeypatch.setattr(os, "link", no_links)
     with pytest.raises(InvalidFile, match=r"out\.nwb: cannot be written: File exists; any"):
         convert_recording(path, out)
     assert out.read_text() == "another program's" and {*tmp_path.iterdir()} == {path, out}
     out.unlink()
-    monkeypatch.setattr("animat.recordings.conversion.write_nwb", write_nwb)
+    monkeypatch.setattr("animat.recordings.formats.nwb_tables.nwb_file", nwb_file)
     assert convert_recording(path, out).equals(read_recording(out)) and {*tmp_path.iterdir()} == {path, out}
 
 

@@ -30,6 +30,7 @@ from animat.robots.grid import grid_for, why_no_grid
 from animat.training.sac import shaped
 from animat.training.settings import SAC
 from animat.wrappers import Wrapper
+from test_loop_starts import Anywhere
 
 
 class At(NamedTuple):
@@ -420,6 +421,11 @@ def test_rollouts_report_the_outcome_of_each_episode() -> None:
 def test_a_start_in_a_region_that_ends_episodes_is_reported() -> None:
     assert "start in" in with_goal(Navigation(), "reach x, y around 0.7, 0.7 radius 10 cm").caveats()[-1]
     assert with_goal(Navigation(), NAVIGATION).caveats() == ()
+    # Where starts are drawn, x uniformly from 0 to 1 m.
+    (half,) = with_goal(Anywhere(), "avoid x below 0.5 m").caveats()
+    share = re.fullmatch(r"goal: (\d+) % of the episodes of anywhere start in the region: avoid x below 0\.5 m", half)
+    assert share is not None and abs(int(share[1]) - 50) < 10
+    assert with_goal(Anywhere(), "avoid x below 0.03 m").caveats() == ()
 
 
 def test_a_goal_is_stored_as_text_with_the_robot() -> None:

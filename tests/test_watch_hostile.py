@@ -10,6 +10,7 @@ import re
 import struct
 import subprocess
 import sys
+import time
 import zlib
 from pathlib import Path
 from random import Random
@@ -244,6 +245,18 @@ def test_a_strange_line_costs_no_more_than_itself_in_a_live_run(tmp_path: Path) 
                 found = LiveView(tmp_path).view(None, 8.0)
                 json.dumps(found, allow_nan=False).encode()
                 assert len(found["blocks"]) == 6 and len(found["blocks"][-1]["rows"]) >= len(LIVE) - 1
+
+
+def test_where_locks_are_unknown_a_live_run_runs_while_anything_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("animat.watch.discovery._LOCKS", tmp_path / "none")
+    (tmp_path / "live.log").write_text(json.dumps(LIVE[0]) + "\n")
+    for seconds_ago, state in ((1000, "silent"), (0, "running")):
+        then = time.time() - seconds_ago
+        os.utime(tmp_path / "live.log", (then, then))
+        os.utime(tmp_path, (then - 1000, then - 1000))
+        assert LiveView(tmp_path).view(None, 8.0)["state"] == state
 
 
 @pytest.mark.oracle

@@ -30,6 +30,7 @@ _ONE = {
     "PathLike": "a path",
     "Policy": "a policy, of those that animat.load_policies returns",
     "Progress": "a progress, such as animat.Bar('training')",
+    "Pulse": "a pulse, such as animat.BALANCED_PULSE",
     "Protocol": "a protocol, such as animat.Protocol(trials=5)",
     "Readouts": "readouts, such as 'halves'",
     "Recording": "a recording, as animat.read_recording returns",
@@ -70,7 +71,8 @@ def checked_arguments(thing: Thing) -> Thing:
     """A decorator of functions and classes: raises InvalidArgument for an argument not of its annotation's kind.
 
     A path in place of the recording that it holds would otherwise fail deep inside. What an annotation cannot say, such
-    as which names are known, is left to the function, as are arrays and anything without an annotation.
+    as which names are known, is left to the function, as are arrays and anything without an annotation. Numpy's scalars
+    become Python's: results are written as JSON, which does not know them.
     """
     if isinstance(thing, type):
         thing.__init__ = checked_arguments(thing.__init__)  # type: ignore[misc]
@@ -82,6 +84,7 @@ def checked_arguments(thing: Thing) -> Thing:
 
     @functools.wraps(function)
     def checked(*args: Any, **kwargs: Any) -> Any:
+        args, kwargs = python_numbers(args), {name: python_numbers(value) for name, value in kwargs.items()}
         try:
             given = signature.bind(*args, **kwargs).arguments
         except TypeError:
@@ -92,6 +95,13 @@ def checked_arguments(thing: Thing) -> Thing:
         return function(*args, **kwargs)
 
     return cast(Thing, checked)
+
+
+def python_numbers(value: Any) -> Any:
+    """A value with Python's numbers in place of numpy's scalars, also in a tuple."""
+    if type(value) is tuple:
+        return tuple(map(python_numbers, value))
+    return value.item() if isinstance(value, np.generic) else value
 
 
 def check_argument(name: str, value: Any, hint: Any) -> None:

@@ -108,14 +108,16 @@ def cached_njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
             dispatcher = numba.njit(cache=True, **options)(function)
         except RuntimeError:
             return numba.njit(**options)(function)
-        # Numba has no option for a disk that is full only when the program has been compiled.
-        save = dispatcher._cache.save_overload
+        # With NUMBA_DISABLE_JIT it is the function itself.
+        if (cache := getattr(dispatcher, "_cache", None)) is not None:
+            save = cache.save_overload
 
-        def save_if_possible(*program: Any) -> None:
-            with suppress(OSError):
-                save(*program)
+            def save_if_possible(*program: Any) -> None:
+                # Numba has no option for a disk that is full by the time the program is compiled.
+                with suppress(OSError):
+                    save(*program)
 
-        dispatcher._cache.save_overload = save_if_possible
+            cache.save_overload = save_if_possible
         return dispatcher
 
     return compiled

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float32
 from numpy.typing import ArrayLike
 
-from animat.arguments import check_argument
+from animat.arguments import check_argument, python_numbers
 from animat.coding.decoder import Decoder, expect_readout_per_command
 from animat.coding.encoder import Encoder
 from animat.coding.mapping import N_PERCENTILES, Mapping, mapping_to_data
@@ -97,6 +97,10 @@ class Loop:
     remembering: HistoryTracker | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            object.__setattr__(self, name, python_numbers(value))
+        check_argument("pulse", self.pulse, Pulse)
+        check_argument("real_time", self.real_time, bool)
         expect_readout_per_command(self.robot.name, self.robot.n_commands, len(self.readouts))
         given, percentiles = self.percentiles, freeze_one(self, "percentiles", np.float32)
         if percentiles.shape != self.decoder.percentiles_shape or not np.all(np.diff(percentiles) >= 0):

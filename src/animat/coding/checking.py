@@ -20,6 +20,9 @@ _PERCENTILES_HZ = {
     " where all percentiles are 0": np.zeros(N_PERCENTILES, np.float32),
 }
 """For a culture with varied responses, one whose response is always the same, and a silent one."""
+for _array in (_RESPONSES_HZ, *_PERCENTILES_HZ.values()):
+    # A mapping that works in place is refused, and the next one checked with the same numbers.
+    _array.setflags(write=False)
 
 
 def check_mapping(mapping: Mapping) -> None:

@@ -146,6 +146,7 @@ def live(
             # If the culture failed or hangs, its state may be inconsistent; that after its last recording is not.
             if gap.session.ending.by not in ("culture", "hang"):
                 run.keep_state()
+            run.write("end", budget=run.account.to_dict())
         except InvalidFile as error:
             # Without room for these files the results are not lost.
             if report is not None:
@@ -161,7 +162,6 @@ def live(
             command = shlex.join(("animat", "run", *of))
             error.add_note(f"what was trained so far can still be run: {command}")
         raise
-    run.write("end", budget=run.account.to_dict())
     return LiveRun(tuple(run.files), policies, tuple(run.swaps), run.iterations, run.culture_min, run.wall_s, gap)
 
 

@@ -25,7 +25,7 @@ from animat.recordings.metadata import LIKE_A_DATE, culture_of, date_of
 from animat.recordings.raw import RawTraces
 from animat.recordings.reading import HDF5, TEXT_NAMES, ZIP, first_bytes, read_recording
 from animat.recordings.recording import Recording
-from animat.writing import atomic_write, clear_leftovers
+from animat.writing import clear_leftovers
 
 _DATE, _TIME = ("".join(rf"(?:(\d+(?:\.\d+)?){unit})?" for unit in units) for units in ("YMWD", "HMS"))
 DURATION = re.compile(rf"P(?=.){_DATE}(?:T(?=\d){_TIME})?", re.ASCII)
@@ -149,18 +149,17 @@ def convert_recording(
         message = f"recorded_at {date} has no time zone and is taken as UTC; add one, such as +09:00"
         findings += (Finding("zone-unknown", "note", message),)
     recording = replace(recording, provenance=provenance, start_min=float(start_min), findings=findings, **read)
-    name = glob.escape(out.name)
-    clear_leftovers(out.parent, name, f".{name}.*")
+    clear_leftovers(out.parent, glob.escape(out.name))
     # Another program may have written it in the meantime, or do so while it is written.
     _expect_new(out)
     # It may hold what NWB cannot.
-    with atomic_write(out, replaces=False) as beside, in_file(path):
-        write_nwb(recording, beside)
+    with in_file(path):
+        write_nwb(recording, out, replaces=False)
     return recording
 
 
 def _expect_new(out: Path) -> None:
-    if out.exists():
+    if out.exists() or out.is_symlink():
         # It may be the recording itself or its stimuli, and is someone's work in any case.
         raise InvalidArgument(f"--out: expected a new file, got {out}, which exists; choose another name")
 

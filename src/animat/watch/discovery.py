@@ -119,7 +119,7 @@ def state_of(folder: Path, *, is_done: bool) -> dict[str, Any]:
     if is_done:
         return {"state": "ended", "message": "everything is done"}
     if (locked := is_locked(folder)) is None:
-        paths = [folder, folder / "jobs", *folder.glob("*/jobs"), *(folder / UNFINISHED).rglob("*")]
+        paths = [folder, *folder.glob("*"), *folder.glob("*/jobs"), *(folder / UNFINISHED).rglob("*")]
         locked = time.time() - max(changed_s(path) or 0.0 for path in paths) < _SILENT_S
     if locked:
         return {"state": "running", "message": ""}

@@ -15,6 +15,9 @@ from animat.watch.view import View, facts, in_blocks, settings, short, table
 _MOST_BYTES = 2**24
 _MOST_POLICIES = 1000
 _MOST_SHOWN = 200
+_FAULTS = ("fault", "interrupted")
+_ENDS = (*_FAULTS, "end")
+"""The last event; without room on the disk a fault may be."""
 _OF_ALL = ("at", "wall_s", "culture_min", "what", "budget")
 """Fields that are shown elsewhere, or in no event of their own."""
 
@@ -43,7 +46,7 @@ class LiveView(View):
             ("iterations of each", _from_to(done)),
             ("minutes at the last event", _passed_min(begun, last)),
             ("minutes of training", begun.get("duration_min", "not known")),
-            ("pulses so far", number(spent.get("pulses"))),
+            ("pulses at the last event", number(spent.get("pulses"))),
         ]
         charts = learning_charts(curves, swaps, None, {}, "")
         return in_blocks(self._state(events), [facts("So far", rows), *charts, _table(events)])
@@ -66,9 +69,9 @@ class LiveView(View):
         names = [event["what"] for event in events]
         # The command locks the whole folder, a run from Python what it writes to.
         parts = self.folder, *(self.folder / part for part in (RECORDINGS, POLICIES, SESSION))
-        state = state_of(next(filter(is_locked, parts), self.folder), is_done=names[-1] == "end")
+        state = state_of(next(filter(is_locked, parts), self.folder), is_done=names[-1] in _ENDS)
         if state["state"] == "ended":
-            why = [event for event in events if event["what"] in ("fault", "interrupted", "closed loop")]
+            why = [event for event in events if event["what"] in (*_FAULTS, "closed loop")]
             return state | {"message": _details(why[-1]) if why else ""}
         if state["state"] == "silent":
             return state | {"message": "its program was killed: what it left can still be used, but not continued"}

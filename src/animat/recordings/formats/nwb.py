@@ -36,6 +36,8 @@ def write_nwb(
     path: str | os.PathLike[str],
     spikes: Iterable[SpikeBlock] | None = None,
     counts: SpikeCounts | None = None,
+    *,
+    replaces: bool = True,
 ) -> None:
     """Write a recording as one NWB file, complete or absent.
 
@@ -43,10 +45,11 @@ def write_nwb(
 
     Args:
         path: parent folders are created, and an old file is replaced only by a complete new one.
+        replaces: whether there may be an old file.
         spikes, counts: instead of the recording's own, which must be empty; may exceed memory, in any order.
 
     Raises:
-        InvalidFile: if the file cannot be written (no permission, a full disk).
+        InvalidFile: if the file cannot be written (no permission, a full disk, an old file that must stay).
         InvalidArgument: for a name that does not end in `.nwb`, text that HDF5 cannot hold, or a `recorded_at` that is
             no date.
         UnusableData: for `spikes` that are not finite, not on a channel, or outside the recording.
@@ -68,7 +71,7 @@ def write_nwb(
         expected = f"times within the recording ({recording.start_s:g} to {recording.stop_s:g} s)"
         raise UnusableData(f"spike_times_s: expected {expected}, got {first_s:g} to {last_s:g} s")
     tree = nwb_file(recording, of_channels)
-    with atomic_write(path) as temporary, _ErrorKeepingFile(temporary, "r+") as disk:
+    with atomic_write(path, replaces=replaces) as temporary, _ErrorKeepingFile(temporary, "r+") as disk:
         try:
             with (
                 h5py.File(disk, "w") as file,
