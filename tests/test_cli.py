@@ -699,6 +699,14 @@ BAD = {
         )
         for option in ("--interventions", "--controls coupling")
     },
+    **{
+        f"{option} with a seed of more than 32 bits": (
+            lambda folder, *_: None,
+            ["run", "{policies}", "--recordings", "{recordings}", *option.split(), "--seed", str(2**32)],
+            ["animat: --seed: expected a whole number from 0 to 4294967295, got 4294967296"],
+        )
+        for option in ("--interventions", "--controls coupling")
+    },
     "recordings for policies without neurons": (
         lambda folder, *_: WITHOUT_NEURONS.save(folder / "p0.safetensors"),
         ["evaluate", "{folder}", "--recordings", "{recordings}"],

@@ -114,6 +114,7 @@ def test_episodes_agree_with_a_plain_loop_of_single_steps() -> None:
     error = np.hypot(many.std() / np.sqrt(len(many)), np.std(returns, ddof=1) / np.sqrt(len(returns)))
     assert abs(many.mean() - np.mean(returns)) < 4 * error
     assert rolled.presented.sum() == rolled.lengths.sum()
+    np.testing.assert_array_equal(rolled.delivered.sum(axis=2), rolled.lengths)
     often = presented > 30
     np.testing.assert_allclose(rolled.presented[0] / rolled.presented.sum(), presented / presented.sum(), atol=0.05)
     mean, n = commanded[often] / presented[often], presented[often]

@@ -47,6 +47,7 @@ from fake_culture import FakeCulture
 from sac_toys import Payer
 from test_bodies_of_others import named
 from test_optimum import STEPS, Stairs, coins
+from test_session_starts import Lasting
 from test_training import SMALL, bits, timeline_of, trained
 
 PLACES: tuple[tuple[int, ...] | str, ...] = (NONE, (101,), (100, 102, 104))
@@ -349,6 +350,23 @@ def test_in_a_loop_nothing_is_lost(pulses: int, tmp_path: Path, monkeypatch: pyt
     silent = next(row for row in gap.rows if row.name == "silent")
     assert silent.electrode_pulses == silent.predicted_electrode_pulses == 0
     json.dumps(gap.to_dict())
+
+
+@pytest.mark.usefixtures("few_bootstraps")
+def test_pulses_are_predicted_from_the_starts_that_an_agent_had(tmp_path: Path, responses: Responses) -> None:
+    """How long an episode of this robot lasts, its start alone decides: predicted and measured pulses are the same."""
+    rng, sizes = np.random.default_rng(1), ((1, 16), (16, 16), (16, 3))
+    weights = tuple(rng.standard_normal(size).astype(np.float32) for size in sizes)
+    policy = policy_of(0, responses, robot=Lasting(), weights=weights, scales=np.ones(1, np.float32))
+    with Answering(3) as culture:
+        gap = run_policies({"p0": policy}, culture, Calibration.of_series([responses]), tmp_path, episodes=9, seed=4)
+    rows = {row.name: row for row in gap.rows}
+    assert len(rows["p0"].measured) == 9
+    for count, condition in zip(COUNTS, responses.conditions, strict=True):
+        row = rows[f"constant {condition.label}"]
+        assert len(row.measured) == 5 and row.measured.mean() != rows["p0"].measured.mean()
+        assert row.predicted_electrode_pulses == pytest.approx(count * row.measured.mean())
+    assert rows["p0"].predicted_electrode_pulses == pytest.approx(rows["p0"].electrode_pulses)
 
 
 def test_constant_agents_cost_what_they_should_on_a_simulator() -> None:

@@ -22,6 +22,7 @@ from scipy.stats import mannwhitneyu, norm, t
 from animat.cli import main
 from animat.closed_loop.adaptive import AdaptiveThresholds
 from animat.closed_loop.agents import ActorController
+from animat.closed_loop.loop import Loop
 from animat.closed_loop.session import read_session
 from animat.coding.mapping import Linear, Mapping, Thresholds
 from animat.cultures.budget import Account, Budget
@@ -46,6 +47,7 @@ from animat.reality_gap.predicting import EPISODES, ROLL_OUTS, predict_agents, r
 from animat.reality_gap.row import resampled_means
 from animat.reality_gap.running import planned_episodes
 from animat.reality_gap.session_responses import read_responses
+from animat.reality_gap.simulation import Simulation
 from animat.reality_gap.table import intervention_table
 from animat.recordings.findings import Finding, warnings_once
 from animat.recordings.formats.nwb import write_nwb
@@ -65,6 +67,7 @@ from animat.training.policy import Policy
 from animat.wrappers import ShuffledDelivery
 from fake_culture import FakeCulture
 from test_loop_starts import Anywhere
+from test_session_starts import Lasting
 
 PROTOCOL = Protocol(order="mixed", pulses=2, patterns=8, trials=40, setup_s=0.1)
 
@@ -864,6 +867,17 @@ def test_returns_are_predicted_from_the_starts_of_the_session(
     for row in rows[:2]:
         of = [episode.agent == row.name for episode in gap.session.episodes if episode.agent in policies]
         np.testing.assert_array_equal(together.expected[of], row.expected)
+
+
+def test_the_ideal_actuator_has_each_start_equally_often(series: list[Responses], calibration: Calibration) -> None:
+    starts = Starts.of_session(1, 30)
+    lasts = [1 + int(4 * Lasting().reset(key)[0]) for key in starts.of_episodes(30)]
+    assert np.mean(lasts) != pytest.approx(np.mean([lasts[i % 30] for i in range(100)]))
+    policies = {"p0": policy_of(0, series, robot=Lasting())}
+    loop, _ = Loop.of_policy(policies["p0"], calibration.percentiles)
+    simulation = Simulation.of(policies, loop, calibration, greedy=True, seed=1, starts=starts)
+    _, (_, returns) = simulation.interventions()
+    assert returns.mean() == pytest.approx(np.mean(lasts))
 
 
 @pytest.mark.oracle
