@@ -135,6 +135,8 @@ def test_reading_the_command_line_imports_nothing_heavy() -> None:
 
 def test_loading_a_policy_needs_no_jax() -> None:
     assert "jax" not in modules_after("import animat.training.policy")
+    # The page's server runs beside a closed loop.
+    assert "jax" not in modules_after("import animat.watch.app")
 
 
 def test_robots_and_goals_are_read_without_what_moves_and_draws_them() -> None:

@@ -154,7 +154,7 @@ def test_what_has_happened_is_watched(ran: tuple[LiveRun, Path, int]) -> None:
     assert rows["pulses at the last event"] == found.gap.account.pulses
     minutes = [f"minute {swap['recorded_at_min']:g}" for swap in found.swaps]
     assert curves["marks"] == [[swap["iterations"], at] for swap, at in zip(found.swaps, minutes, strict=True)]
-    assert rows["newest in use"] == f"that of {minutes[-1]}"
+    assert rows["newest swapped in"] == f"that of {minutes[-1]}"
     *each, mean = curves["series"]
     assert [of["y"] for of in each] == [
         [None if np.isnan(y) else pytest.approx(y) for y in policy.learning_curve[:, 2].tolist()]
@@ -178,6 +178,12 @@ def test_a_live_run_is_watched_until_it_is_killed(ran: tuple[LiveRun, Path, int]
             assert shown["state"] == "running" and shown["message"].startswith(message)
         killed = LiveView(tmp_path).view(None, 8.0)
         assert killed["state"] == "silent" and "was killed" in killed["message"]
+    # Each group swaps at a chunk of its own; the first counts.
+    swaps = [
+        {"what": "swap", "members": [i], "iterations": n, "recorded_at_min": 10.2} for i, n in ((0, 500), (1, 300))
+    ]
+    (tmp_path / LOG_FILE).write_text(whole[0] + "".join(json.dumps(swap) + "\n" for swap in swaps))
+    assert LiveView(tmp_path).view(None, 8.0)["blocks"][1]["marks"] == [[300, "minute 10.2"]]
     # Without room on the disk the end may be missing.
     for end in ('{"what": "end"}\n', ""):
         (tmp_path / LOG_FILE).write_text(whole[0] + '{"what": "fault", "message": "gone"}\n' + end)

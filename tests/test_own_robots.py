@@ -301,6 +301,19 @@ def test_what_a_callback_of_jax_raises_is_said_without_its_traceback() -> None:
     assert first_line(raised.value, with_place=False) == "ValueError: the wheel fell off"
 
 
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"reset": lambda self, key: At(jnp.float32(np.random.default_rng().random()))},
+        {"observe": lambda self, state: jnp.stack(state) + np.random.default_rng().random(1).astype(np.float32) / 10},
+    ],
+)
+def test_random_numbers_of_numpy_are_refused(changed: dict[str, Any]) -> None:
+    """They would be drawn once, when it is compiled: every episode would start alike."""
+    with pytest.raises(InvalidArgument, match=r"^Changed: expected steps that depend on nothing but their arguments"):
+        check_robot(slider(**changed))
+
+
 def test_a_method_that_is_missing_is_named() -> None:
     with pytest.raises(TypeError, match=r"abstract method.*observe"):
         type("Blind", (Slider,), {"observe": Robot.observe})()

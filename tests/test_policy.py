@@ -107,6 +107,7 @@ def test_numpy_answers_as_jax_does(seed: int) -> None:
         exact = np.maximum(exact @ w.astype(np.float64) + b, 0)
     exact = exact @ policy.weights[-1].astype(np.float64) + policy.biases[-1]
     np.testing.assert_allclose(policy.outputs(observation.astype(np.float64)), exact, rtol=1e-6, atol=1e-6)
+    np.testing.assert_array_equal(policy.outputs(jnp.asarray(observation)), policy.outputs(observation))
 
 
 @pytest.mark.oracle

@@ -23,6 +23,8 @@ MARKERS: dict[FolderKind, tuple[str, ...]] = {
     "live": ("live.log",),
 }
 """Names or patterns, any one of which is enough. The modules that write these files import JAX; this one does not."""
+RECORDINGS, POLICIES, SESSION = "recordings", "policies", "session"
+"""The parts of a live run's folder."""
 _DESCRIPTIONS: dict[FolderKind, str] = {
     "session": "a session",
     "training": "policies",

@@ -16,7 +16,7 @@ from animat.terminal_table import align_columns
 @dataclass(frozen=True)
 class Recover(Command):
     """Write the recording of a closed-loop session that was killed, from its log; or keep what a device had recorded
-    when animat record or animat live was killed."""
+    when animat record or animat live was killed or found no room on the disk."""
 
     session: Positional[Path] = Path("session")
     """The session's folder, or one of recordings"""
@@ -37,7 +37,7 @@ class Recover(Command):
         kept = sorted(set((folder / INTERRUPTED).glob("*")) - before)
         for file in kept:
             is_damaged = "; it is damaged, and kept as it is" if file.suffix == ".npz" else ""
-            print(f"{file}: what a run that was killed had recorded{is_damaged}")
+            print(f"{file}: what the run before had recorded{is_damaged}")
         if not kept:
             print(f"{folder}: nothing to keep: the recording that was cut short can be made again")
         return {"recordings": [str(file) for file in kept]}

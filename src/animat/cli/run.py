@@ -166,6 +166,7 @@ class Run(StimulationOptions):
         for option in (option for option, is_given in in_jax.items() if is_given):
             if isinstance(first.robot, HostRobot):
                 raise InvalidArgument(f"{option}: expected a robot in JAX, got {first.robot.name}; leave it out")
+        if any(in_jax.values()):
             check_seed(self.seed)
         return policies, first
 

@@ -74,10 +74,11 @@ class PartialRecording:
                 return
         # Where there is no room for a recording there may still be some for this file, which is smaller.
         self._write()
-        if self._path.exists():
-            error.add_note(f"what was recorded so far is in {self._path}: make room, and animat recover keeps it")
-        else:
-            error.add_note("and then: what was recorded so far could not be kept")
+        with suppress(OSError):
+            if self._path.stat().st_size:
+                error.add_note(f"what was recorded so far is in {self._path}: make room, and animat recover keeps it")
+                return
+        error.add_note("and then: what was recorded so far could not be kept")
 
     def finish(self, recording: Recording, write: Callable[[], object]) -> None:
         """Write the whole recording, on a full disk in place of the file of the one in progress."""

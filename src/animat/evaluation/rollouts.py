@@ -357,7 +357,7 @@ class Trajectories(NamedTuple):
 def trajectories(
     environment: Environment[Any], simulator: Neurons, actors: Actor, *, episodes: int, seed: int
 ) -> Trajectories:
-    """Run episodes of each actor on a robot in JAX; arguments and errors as in `roll_out`."""
+    """Run episodes of each actor on a robot in JAX; arguments as in `roll_out`, InvalidArgument as in `check_seed`."""
     check_seed(seed)
     n_actors = actors.n_actors
     keys = jax.random.split(jax.random.key(seed), n_actors * episodes).reshape(n_actors, episodes)

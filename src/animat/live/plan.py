@@ -16,6 +16,7 @@ from animat.coding.mapping import N_PERCENTILES
 from animat.cultures.budget import Account
 from animat.cultures.series import minutes_of
 from animat.errors import BudgetSpent, InvalidArgument, Mismatch
+from animat.folders import RECORDINGS
 from animat.plain_file import expect_no_file
 from animat.recordings.formats.npz import UNDER_WAY
 from animat.records import Positive, record
@@ -27,7 +28,6 @@ from animat.training.specification import Training
 from animat.writing import LOCK
 
 LOG_FILE = "live.log"
-RECORDINGS, POLICIES, SESSION = "recordings", "policies", "session"
 
 
 @record

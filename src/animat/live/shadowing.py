@@ -22,7 +22,8 @@ from animat.cultures.series import STATE_FILE, order_seed, room_bytes_of
 from animat.cultures.under_way import PartialRecording
 from animat.cultures.virtual import VirtualCulture
 from animat.errors import AnimatError, BudgetSpent, InvalidFile, Mismatch, UnusableData, as_invalid_file, counted
-from animat.live.plan import LOG_FILE, POLICIES, RECORDINGS, SESSION, Timetable, check_plan, for_the_first_recording
+from animat.folders import POLICIES, RECORDINGS, SESSION
+from animat.live.plan import LOG_FILE, Timetable, check_plan, for_the_first_recording
 from animat.live.trainers import Trainers
 from animat.neurons.timeline import SimulatorKind, SimulatorTimeline, fit_timeline
 from animat.progress import Part, Progress, in_phase

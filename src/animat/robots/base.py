@@ -37,7 +37,7 @@ MOST_ITERATIONS = 2_000_000_000
 """Most iterations of a training: they are counted in 32 bits, with room for a last round of all environments."""
 
 MOST_AT_ONCE = 5_000_000
-"""Most episodes side by side: each takes some 300 bytes."""
+"""Most episodes side by side: each takes some 300 bytes, and 12 for each condition."""
 
 LEAST_SCALE, LARGEST_SCALE = 1e-12, 1e12
 """Limits of a quantity's scale, within which a float32 network can compute with the scaled quantity."""

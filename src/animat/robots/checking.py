@@ -50,7 +50,14 @@ def _check_compiled(robot: Robot[Any]) -> None:
         # Traced twice, by functions that JAX takes to be different: a value kept from the first trace fails in the
         # second. Under jit, which shows what a step may not do there, and compiles it once.
         jax.eval_shape(lambda key: episode(key), key)
-        return jax.device_get(jax.jit(episode)(key))
+        ran = jax.device_get(jax.jit(episode)(key))
+        # Numbers that are drawn while it is traced are constants of the program.
+        one, other = (jax.make_jaxpr(lambda key: episode(key))(key) for _ in range(2))
+        if str(one) != str(other) or not all(map(np.array_equal, one.consts, other.consts)):
+            expected = "steps that depend on nothing but their arguments"
+            got = "different ones each time: draw random numbers from reset's key, or use advance's uniforms"
+            raise InvalidArgument(f"{name}: expected {expected}, got {got}")
+        return ran
 
     try:
         outputs, commands = _call(name, run, jax.random.key(0))

@@ -214,7 +214,8 @@ class Policy:
         if getattr(observation, "shape", None) != shape and np.shape(observation) != shape:
             got, name = np.shape(observation), self.robot.name
             raise InvalidArgument(f"observation: expected one of {name}, shape {shape}, got shape {got}")
-        hidden = observation / self.scales
+        # From JAX too, such as `environment.observe(state)`.
+        hidden = np.asarray(observation) / self.scales
         if not np.isfinite(hidden).all():
             raise InvalidArgument(f"observation: expected finite numbers, got {np.asarray(observation).tolist()}")
         for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):

@@ -6,7 +6,7 @@ import json
 from typing import Any
 
 from animat.errors import InvalidFile
-from animat.live.plan import POLICIES, RECORDINGS, SESSION
+from animat.folders import POLICIES, RECORDINGS, SESSION
 from animat.watch.discovery import is_locked, state_of
 from animat.watch.files import listed, mapped, number, text, text_of
 from animat.watch.learning import Curves, curve_of_policy, learning_charts
@@ -42,7 +42,7 @@ class LiveView(View):
         rows: list[tuple[str, Any]] = [
             ("policies", begun.get("policies", "not known")),
             ("recordings", len(recorded)),
-            ("newest in use", f"that of {swaps[-1][1]}" if swaps else "the first"),
+            ("newest swapped in", f"that of {swaps[-1][1]}" if swaps else "the first"),
             ("iterations of each", _from_to(done)),
             ("minutes at the last event", _passed_min(begun, last)),
             ("minutes of training", begun.get("duration_min", "not known")),
