@@ -26,7 +26,7 @@ from animat.evaluation.rollouts import HeuristicPolicy
 from animat.execution.training import train
 from animat.robots import ROBOTS, Cartpole, Navigation, Quantity, Robot
 from animat.robots.checking import check_robot
-from animat.robots.grid import why_no_grid
+from animat.robots.grid import Axis, Grid, why_no_grid
 from animat.robots.registry import REGISTRY, register_robot, robot_named
 from animat.training.policy import load_policies
 from animat.training.specification import Training
@@ -312,6 +312,38 @@ def test_random_numbers_of_numpy_are_refused(changed: dict[str, Any]) -> None:
     """They would be drawn once, when it is compiled: every episode would start alike."""
     with pytest.raises(InvalidArgument, match=r"^Changed: expected steps that depend on nothing but their arguments"):
         check_robot(slider(**changed))
+
+
+@pytest.mark.parametrize(
+    ("to_coordinates", "to_state", "words"),
+    [
+        (lambda state: (state.x_m,), lambda c: At(-c[0]), r"value_grid: expected .*\(\(0\.4\)\)\) to .* got \(-0\.4\)"),
+        (lambda state: (state.x_m,), lambda c: At(c[0] * jnp.nan), r"value_grid: .* to be the same, got \(nan\)"),
+        (lambda state: (state.x_m,) * 2, lambda c: At(c[0]), r"value_grid: .* to be the same, got \(-0\.4, -0\.4\)"),
+        (lambda state: (state.v,), lambda c: At(c[0]), r"value_grid\.to_coordinates: expected .* no attribute 'v'"),
+        (lambda state: (state.x_m,), lambda c: 1 / 0, r"value_grid\.to_state: expected .* ZeroDivisionError"),
+        (lambda state: (state.x_m,), lambda c: c, r"value_grid\.to_state: expected the state's structure from reset"),
+    ],
+)
+def test_a_grid_whose_states_are_not_those_of_its_coordinates_is_refused(
+    to_coordinates: Any, to_state: Any, words: str
+) -> None:
+    """The optimal return would be that of another task."""
+    grid = Grid(Axis("x", "m", -1.0, 1.0, 9), (), to_coordinates, to_state)
+    with pytest.raises(InvalidArgument, match=f"^Changed.{words}"):
+        check_robot(slider(value_grid=lambda self: grid))
+    check_robot(slider(value_grid=lambda self: Grid(grid.along, (), lambda state: (state.x_m,), lambda c: At(c[0]))))
+
+
+def test_parameters_that_a_file_changes_are_said_to_be_so() -> None:
+    @dataclasses.dataclass(frozen=True)
+    class Bounded(Slider):
+        bound_m: float = float("nan")
+        name: ClassVar[str] = "bounded"
+
+    register_robot(Bounded)
+    with pytest.raises(InvalidArgument, match=r"parameters that a policy's file can hold, .*: bound_m$"):
+        REGISTRY.expect_loadable(Bounded())
 
 
 def test_a_method_that_is_missing_is_named() -> None:

@@ -167,15 +167,19 @@ def test_a_study_leaves_out_what_it_cannot_do_and_says_so(package: Path) -> None
 
 
 @pytest.mark.oracle
-def test_what_is_registered_in_a_script_is_found_by_its_workers(package: Path) -> None:
+@pytest.mark.parametrize("executor", ["None", "ProcessPoolExecutor(1, get_context('spawn'))"])
+def test_what_is_registered_in_a_script_is_found_by_its_workers(executor: str, package: Path) -> None:
     """A script's own robot, in `__main__`; its output is not mistaken for a worker's report."""
     script = """
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from multiprocessing import get_context
 import animat
 from my_package.robots import Rover
 from test_training import SMALL, timeline_of
 
-print("imported")
+if __name__ != "__mp_main__":
+    print("imported")
 
 @animat.register_robot
 @dataclass(frozen=True)
@@ -184,10 +188,10 @@ class Mine(Rover):
 
 if __name__ == "__main__":
     training = animat.Training(Mine(), "1-threshold", policies=1, iterations=240, algorithm=SMALL)
-    print(animat.train(training, timeline_of(), "out")["p0"].robot)
+    print(animat.train(training, timeline_of(), "out", executor=EXECUTOR)["p0"].robot)
 """
     environment = {**os.environ, "PYTHONPATH": ":".join([str(Path(__file__).parent), *sys.path])}
-    (package / "my_script.py").write_text(script)
+    (package / "my_script.py").write_text(script.replace("EXECUTOR", executor))
     ran = subprocess.run([sys.executable, "my_script.py"], capture_output=True, text=True, env=environment)
     assert ran.stdout.splitlines() == ["imported", "Mine(gain_m=0.1, episode_limit=20)"], ran.stderr
     mine = {"name": "mine", "parameters": {"gain_m": 0.1, "episode_limit": 20}, "import": "my_script:Mine"}

@@ -15,12 +15,14 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Generic, TypeVar
 
-from animat.errors import InvalidArgument, did_you_mean, first_line, shown, within
+from animat.errors import InvalidArgument, did_you_mean, first_line, shown, some_of, within
 
 Thing = TypeVar("Thing")
 
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,40}")
 _PLACE = re.compile(r"[\w.]{1,200}:[\w.<>]{1,200}")
+_MAIN = ("__main__", "__mp_main__")
+"""What the module of a script is called where it was started, and in processes that import it as their own."""
 _IN_MEMORY = "train in memory: train(training, timeline, None)"
 
 _registries: dict[type, Registry[Any]] = {}
@@ -73,7 +75,7 @@ class Registry(Generic[Thing]):
                 f"{place}.name: expected a name that no other {noun} has, got {name!r}, which is {other}"
             )
         self._registered[name] = kind
-        if kind.__module__ == "__main__":
+        if kind.__module__ in _MAIN:
             # In a worker, __main__ is the worker; classes of a script are imported there by the script's file name.
             copyreg.pickle(kind, self._reduce)
 
@@ -191,7 +193,11 @@ class Registry(Generic[Thing]):
         if (name in self._ours and self._ours[name] == thing) or self._family_of(name) is not None:
             return
         is_registered = self._registered.get(name) is kind
-        if not is_registered or self.from_dict(json.loads(json.dumps(self.to_dict(thing)))) != thing:
+        if is_registered and (back := self.from_dict(json.loads(json.dumps(self.to_dict(thing))))) != thing:
+            changed = [name for name, value in vars(thing).items() if vars(back).get(name) != value]
+            expected = "parameters that a policy's file can hold, such as numbers and text"
+            raise InvalidArgument(f"{noun}: expected {expected}, got others when read back: {some_of(changed)}")
+        if not is_registered:
             raise InvalidArgument(
                 f"{noun}: expected a registered one, as a policy's file stores the name of its {noun}, got "
                 f"{kind.__name__}, which is not registered: write @animat.register_{noun} above its class, or "
@@ -273,7 +279,7 @@ def imported(noun: str, place: str) -> Any:
 def place_of(kind: type) -> str:
     """Where a class can be imported from, as `module:Class`; the module of a script is named after its file."""
     module = kind.__module__
-    if module == "__main__":
+    if module in _MAIN:
         main = sys.modules[module]
         spec, file = getattr(main, "__spec__", None), getattr(main, "__file__", None)
         module = spec.name if spec else Path(file).stem if file else module

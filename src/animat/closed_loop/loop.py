@@ -101,6 +101,7 @@ class Loop:
             object.__setattr__(self, name, python_numbers(value))
         check_argument("pulse", self.pulse, Pulse)
         check_argument("real_time", self.real_time, bool)
+        check_argument("remembering", self.remembering, HistoryTracker | None)
         expect_readout_per_command(self.robot.name, self.robot.n_commands, len(self.readouts))
         given, percentiles = self.percentiles, freeze_one(self, "percentiles", np.float32)
         if percentiles.shape != self.decoder.percentiles_shape or not np.all(np.diff(percentiles) >= 0):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import lru_cache, partial
 from typing import Any
 
@@ -33,7 +33,7 @@ def check_robot(robot: Robot[Any]) -> None:
     else:
         _check_compiled(robot)
     if (value_grid := getattr(robot, "value_grid", None)) is not None:
-        _expect_grid(f"{type(robot).__name__}.value_grid", value_grid)
+        _expect_grid(f"{type(robot).__name__}.value_grid", robot, value_grid)
     expected = "a tuple of strings"
     caveats = _call(what := f"{type(robot).__name__}.caveats", robot.caveats, expected=expected)
     if not isinstance(caveats, tuple) or not all(isinstance(caveat, str) for caveat in caveats):
@@ -132,7 +132,7 @@ def _outputs(robot: Robot[Any], state: Any, reward: Any) -> tuple[Any, ...]:
     return state, observation, jnp.asarray(reward, jnp.float32), values.get("potential", 0.0)
 
 
-def _expect_grid(what: str, value_grid: Callable[[], Any]) -> None:
+def _expect_grid(what: str, robot: Robot[Any], value_grid: Callable[[], Any]) -> None:
     try:
         grid = value_grid()
     except (AnimatError, NotImplementedError):
@@ -142,6 +142,26 @@ def _expect_grid(what: str, value_grid: Callable[[], Any]) -> None:
         raise InvalidArgument(f"{what}: expected a Grid, got {first_line(error)}") from error
     if not isinstance(grid, Grid):
         raise InvalidArgument(f"{what}: expected a Grid, got {shown(grid)}")
+    # At a place within it that differs from axis to axis.
+    axes = (grid.along, *grid.rows)
+    shares = np.linspace(0.3, 0.6, len(axes))
+    given = [axis.low + share * (axis.high - axis.low) for axis, share in zip(axes, shares, strict=True)]
+
+    def located(at: Sequence[float]) -> list[float]:
+        state = _call(f"{what}.to_state", grid.to_state, tuple(map(jnp.float32, at)))
+        _expect_same_structure(f"{what}.to_state", state, robot.reset(jax.random.key(0)))
+        return list(_call(f"{what}.to_coordinates", lambda: [float(each) for each in grid.to_coordinates(state)]))
+
+    # A coordinate that does not matter may be left out of the state, once for all.
+    given = located(given)
+    back = np.array(located(given))
+    lengths = np.array([axis.high - axis.low if axis.periodic else np.inf for axis in axes])
+    if len(back) == len(given) == len(axes):
+        off = np.abs(back - given)
+        if np.all(np.minimum(off, np.abs(off - lengths)) < [axis.step / 100 for axis in axes]):
+            return
+    expected, got = ", ".join(f"{each:g}" for each in given), ", ".join(f"{each:g}" for each in back)
+    raise InvalidArgument(f"{what}: expected to_coordinates(to_state(({expected}))) to be the same, got ({got})")
 
 
 def _expect_attributes(robot: Robot[Any]) -> None:
