@@ -194,7 +194,8 @@ class Registry(Generic[Thing]):
             return
         is_registered = self._registered.get(name) is kind
         if is_registered and (back := self.from_dict(json.loads(json.dumps(self.to_dict(thing))))) != thing:
-            changed = [name for name, value in vars(thing).items() if vars(back).get(name) != value]
+            names = [field.name for field in dataclasses.fields(thing)]  # type: ignore[arg-type]
+            changed = [name for name in names if getattr(back, name) != getattr(thing, name)]
             expected = "parameters that a policy's file can hold, such as numbers and text"
             raise InvalidArgument(f"{noun}: expected {expected}, got others when read back: {some_of(changed)}")
         if not is_registered:

@@ -190,8 +190,9 @@ class _Run:
         self._known_s = self._zero_s
         with as_invalid_file(self.folder, "cannot be made"):
             self.folder.mkdir(parents=True, exist_ok=True)
-        training, times = self.training, {"duration_min": self.timetable.duration_min}
-        self.write("begun", robot=training.robot.name, policies=training.policies, seed=training.seed, **times)
+        training, duration_min = self.training, self.timetable.duration_min
+        begun = {"robot": training.robot.name, "policies": training.policies, "seed": training.seed}
+        self.write("begun", **begun, duration_min=duration_min)
 
     def shadow(self, progress: Progress | None) -> dict[str, Policy]:
         """Record and train to the end; returns the policies."""
