@@ -43,6 +43,14 @@ def test_what_a_full_disk_cannot_keep_is_compiled_all_the_same(monkeypatch: pyte
     assert cached_njit(error_model="numpy")(tripled)(4) == 12
 
 
+def test_with_compilation_turned_off_it_is_the_function_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+    def halved(x: int) -> float:
+        return x / 2
+
+    monkeypatch.setattr(numba.config, "DISABLE_JIT", True)
+    assert cached_njit(error_model="numpy")(halved) is halved
+
+
 def test_nobody_s_home_is_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
     def unknown() -> Path:
         raise RuntimeError("Could not determine home directory.")

@@ -209,6 +209,13 @@ def test_a_file_that_another_program_wrote_in_the_meantime_is_kept(
     assert out.read_text() == "another program's"
 
 
+def test_a_link_that_leads_nowhere_is_refused_before_anything_is_read(tmp_path: Path) -> None:
+    (tmp_path / "out.nwb").symlink_to(tmp_path / "nowhere.nwb")
+    with pytest.raises(InvalidArgument, match="--out: expected a new file, got"):
+        convert_recording(tmp_path / "no such recording.npz", tmp_path / "out.nwb")
+    assert [file.name for file in tmp_path.iterdir()] == ["out.nwb"]
+
+
 @pytest.mark.parametrize("has_links", [True, False])
 def test_a_file_that_another_program_wrote_during_the_last_step_is_kept(
     has_links: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
