@@ -14,6 +14,8 @@ from animat.training.policy import CURVE, whole_curve
 from animat.watch.files import expect_own
 from animat.watch.view import chart, curve
 
+MOST_POLICIES = 1000
+"""Most policies whose learning curves are shown."""
 _LEARNER = (
     ("entropy", "nats", "Of the policy's choice of actions: high while it is almost random, low once it is certain."),
     ("alpha", "", "The weight of entropy relative to reward, adjusted so that entropy reaches its target."),

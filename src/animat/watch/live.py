@@ -9,11 +9,10 @@ from animat.errors import InvalidFile
 from animat.folders import POLICIES, RECORDINGS, SESSION
 from animat.watch.discovery import is_locked, state_of
 from animat.watch.files import listed, mapped, number, text, text_of
-from animat.watch.learning import Curves, curve_of_policy, learning_charts
+from animat.watch.learning import MOST_POLICIES, Curves, curve_of_policy, learning_charts
 from animat.watch.view import View, facts, in_blocks, settings, short, table
 
 _MOST_BYTES = 2**24
-_MOST_POLICIES = 1000
 _MOST_SHOWN = 200
 _FAULTS = ("fault", "interrupted")
 _ENDS = (*_FAULTS, "end")
@@ -60,7 +59,7 @@ class LiveView(View):
 
     def _curves(self, policies: float) -> Curves:
         """The learning curves of the policies saved so far."""
-        files = {i: self.folder / POLICIES / f"p{i}.safetensors" for i in range(min(int(policies), _MOST_POLICIES))}
+        files = {i: self.folder / POLICIES / f"p{i}.safetensors" for i in range(min(int(policies), MOST_POLICIES))}
         curves = {i: self._cached_content(file, curve_of_policy) for i, file in files.items()}
         return {i: rows for i, rows in curves.items() if rows is not None}
 

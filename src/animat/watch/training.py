@@ -12,10 +12,9 @@ import numpy as np
 from animat.execution.task import UNFINISHED
 from animat.watch.discovery import is_locked, state_of
 from animat.watch.files import JobProgress, arrays_in, job_progress, json_of, listed, mapped, number, text
-from animat.watch.learning import Curves, curve_of_policy, learning_charts, with_all_columns
+from animat.watch.learning import MOST_POLICIES, Curves, curve_of_policy, learning_charts, with_all_columns
 from animat.watch.view import View, facts, in_blocks, settings, table, time_left
 
-_MOST_POLICIES = 1000
 _MOST_BYTES = 2**22
 _CHUNKS = 60
 """Parts of a training, and points of a learning curve."""
@@ -31,7 +30,7 @@ class TrainingView(View):
         manifest = self._manifest()
         training = manifest["training"]
         minutes = (manifest.get("simulators") or {}).get("recorded_at_min", [])
-        planned, iterations = min(training["policies"], _MOST_POLICIES), training["iterations"]
+        planned, iterations = min(training["policies"], MOST_POLICIES), training["iterations"]
         progress = job_progress(self.folder)
         # What a stopped training had done since its last checkpoint is lost.
         curves, shares = self._curves_so_far(planned, {} if is_locked(self.folder) is False else progress)
