@@ -83,7 +83,7 @@ export class Frame {
       const at = this.atY(each);
       if (at < this.top - 1 || at > this.bottom + 1) return;
       if (!options.yLabels) this.#rule(this.left, at, this.right, at, colour("grid"));
-      g.fillText(labels[i], this.left - 5, at);
+      g.fillText(labels[i], this.left - 5, Math.max(at, 7));
     });
     Object.assign(g, { textBaseline: "top", textAlign: "center" });
     for (const each of marks(this.x[0], this.x[1], Math.max(2, Math.floor((this.right - this.left) / 70)))) {
