@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import animat
+from animat.registry import Registry
 
 project, author = "animat", "the maintainers of animat"
 release = importlib.metadata.version("animat")
@@ -23,7 +24,7 @@ napoleon_attr_annotations = False
 python_maximum_signature_line_length = 100
 html_theme = "furo"
 html_title = f"animat {release}"
-html_show_sourcelink = False
+html_show_sourcelink = html_show_copyright = False
 
 _GUIDE = (
     *("recordings", "cultures", "virtual-culture", "hardware", "recording-a-culture", "responses"),
@@ -75,7 +76,10 @@ def _prepare(app: Any, what: str, name: str, thing: Any, options: Any, lines: li
 def _signature(
     app: Any, what: str, name: str, thing: Any, options: Any, signature: str | None, returned: str | None
 ) -> tuple[str | None, str | None]:
-    """Make the defaults of dataclasses readable for Sphinx, which otherwise shows the text as it is."""
+    """Make defaults of dataclasses readable, and name what a registry's functions return, not its type variable."""
+    registry = getattr(thing, "__self__", None)
+    if isinstance(registry, Registry) and returned == "~animat.registry.Thing":
+        returned = registry.base.__name__
     return signature and signature.replace("<factory>", "..."), returned
 
 

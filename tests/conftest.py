@@ -6,6 +6,7 @@ import gc
 import importlib
 import itertools
 import os
+import shutil
 import signal
 import sys
 import threading
@@ -15,6 +16,7 @@ from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from hypothesis import settings
@@ -187,3 +189,23 @@ def quick_coupling(monkeypatch: pytest.MonkeyPatch) -> None:
 def few_bootstraps(monkeypatch: pytest.MonkeyPatch) -> None:
     """Predictions with intervals from few simulators, for tests of what else a closed loop says and does."""
     monkeypatch.setattr("animat.reality_gap.calibration.BOOTSTRAPS", 4)
+
+
+@pytest.fixture
+def browser() -> Iterator[Any]:
+    """Chromium without a window, driven by selenium; skips where one of them is absent."""
+    needed = "needs chromium, chromedriver and selenium"
+    webdriver = pytest.importorskip("selenium.webdriver", reason=needed)
+    chromium, chromedriver = (shutil.which(name) for name in ("chromium", "chromedriver"))
+    if not (chromium and chromedriver):
+        pytest.skip(needed)
+    options = webdriver.ChromeOptions()
+    options.binary_location = chromium
+    for argument in ("--headless=new", "--no-sandbox", "--window-size=1400,1000", "--disable-dev-shm-usage"):
+        options.add_argument(argument)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    driver = webdriver.Chrome(options=options, service=webdriver.ChromeService(chromedriver))
+    try:
+        yield driver
+    finally:
+        driver.quit()

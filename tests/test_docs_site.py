@@ -25,5 +25,8 @@ def test_the_site_builds_without_a_warning_and_explains_every_public_name(tmp_pa
     # Equations stand as they were written, and no section of a docstring is shown as text.
     assert re.search(r"<pre>.*U_1</span> <span[^>]*>=", page)
     assert not re.search(r"<p>(Args|Raises|Returns|Attributes):", page)
+    # Of a type, not of a type variable.
+    assert ">Robot<" in page.split('id="animat.robot_named"')[1].split("</dt>")[0]
+    assert ">Thing<" not in page
     front = (tmp_path / "site" / "README.html").read_text()
     assert all(f'href="{page.stem}' in front or f"/{page.stem}.html" in front for page in (ROOT / "docs").glob("*.md"))

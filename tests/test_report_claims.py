@@ -178,7 +178,7 @@ def test_not_finding_a_difference_is_not_called_no_difference() -> None:
 def test_a_comparison_is_explained_by_its_optima() -> None:
     assert "other way round" in explain(ROW)
     # Ties can make p smaller: of four equal returns against four larger ones it is 0.013.
-    assert "below 0.03, unless some have equal returns: use more policies" in explain(replace(ROW, n=4))
+    assert "below 0.0304, unless some have equal returns: use more policies" in explain(replace(ROW, n=4))
     assert compare(np.zeros(4), np.ones(4)).p_normal < 0.014
     assert explain(replace(ROW, n=1)).startswith("With 1 policy per side")
     assert "nothing to learn" in explain(replace(ROW, optimum_second=-79.8))

@@ -608,6 +608,24 @@ def test_the_example_of_the_page_runs(
 
 
 @pytest.mark.oracle
+@pytest.mark.filterwarnings("ignore::ResourceWarning")
+def test_no_table_or_figure_is_cut_off_in_print(finished: Path, browser: Any) -> None:
+    """Tables that scroll on a screen lost their last columns on paper."""
+    browser.get((finished / "report.html").as_uri())
+    cut_off = "return [...document.querySelectorAll('.wide > *')].filter(each => {where}).length"
+    scrolling = cut_off.format(where="getComputedStyle(each.parentElement).overflowX !== 'visible'")
+    beyond = cut_off.format(where="each.getBoundingClientRect().right > innerWidth")
+    assert browser.execute_script(scrolling) > 10
+    # The width of A4 in landscape, less margins of a centimetre.
+    size = {"width": 1046, "height": 718, "deviceScaleFactor": 1, "mobile": False}
+    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "print"})
+    assert (browser.execute_script(scrolling), browser.execute_script(beyond)) == (0, 0)
+    tallest = "return Math.max(...[...document.querySelectorAll('figure')].map(each => each.offsetHeight))"
+    assert browser.execute_script(tallest) < size["height"]
+
+
+@pytest.mark.oracle
 def test_the_report_holds_every_figure_and_table(finished: Path) -> None:
     page = (finished / "report.html").read_text()
     expected = ["headline"] + [f"culture-{name}" for name in CULTURE] + [f"navigation-{name}" for name in ROBOT]

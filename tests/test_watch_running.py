@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import csv
-import importlib.util
 import os
 import re
 import shutil
@@ -122,29 +121,7 @@ def end_servers() -> None:
             os.waitpid(number, 0)
 
 
-CHROMIUM, DRIVER = (shutil.which(name) for name in ("chromium", "chromedriver"))
-HAS_BROWSER = CHROMIUM and DRIVER and importlib.util.find_spec("selenium")
-
-
-@pytest.fixture
-def browser() -> Iterator[Any]:
-    from selenium import webdriver
-    from selenium.webdriver.chrome.service import Service
-
-    options = webdriver.ChromeOptions()
-    options.binary_location = CHROMIUM or ""
-    for argument in ("--headless=new", "--no-sandbox", "--window-size=1400,1000", "--disable-dev-shm-usage"):
-        options.add_argument(argument)
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
-    driver = webdriver.Chrome(options=options, service=Service(DRIVER))
-    try:
-        yield driver
-    finally:
-        driver.quit()
-
-
 @pytest.mark.oracle
-@pytest.mark.skipif(not HAS_BROWSER, reason="needs chromium, chromedriver and selenium")
 @pytest.mark.filterwarnings("ignore::ResourceWarning")
 def test_a_session_is_watched_and_stopped_in_a_browser(tmp_path: Path, browser: Any) -> None:
     folder = tmp_path / "<img src=x onerror=alert(1)>"
@@ -179,7 +156,6 @@ def test_a_session_is_watched_and_stopped_in_a_browser(tmp_path: Path, browser: 
 
 
 @pytest.mark.oracle
-@pytest.mark.skipif(not HAS_BROWSER, reason="needs chromium, chromedriver and selenium")
 @pytest.mark.filterwarnings("ignore::ResourceWarning")
 def test_with_the_server_killed_the_page_says_how_to_stop_a_session(tmp_path: Path, browser: Any) -> None:
     folder = tmp_path / "session"

@@ -43,7 +43,7 @@ class Registry(Generic[Thing]):
         self, noun: str, base: type[Thing], ours: Mapping[str, Thing] | None = None, reserved: Collection[str] = ()
     ) -> None:
         self.noun, self.entry_points = noun, f"animat.{noun}s"
-        self._base, self._ours, self._reserved = base, dict(ours or {}), (*(ours or {}), *reserved)
+        self.base, self._ours, self._reserved = base, dict(ours or {}), (*(ours or {}), *reserved)
         self._registered: dict[str, type[Thing]] = {}
         self._families: dict[str, type[Any]] = {}
         self.kinds: Mapping[str, type[Thing]] = MappingProxyType(self._registered)
@@ -52,13 +52,13 @@ class Registry(Generic[Thing]):
 
     def __reduce__(self) -> tuple[Any, ...]:
         # Unpickling the base imports its module or package, which creates the registry.
-        return _registry_of, (self._base,)
+        return _registry_of, (self.base,)
 
     def register(self, kind: type[Thing]) -> None:
         """Register a class under its name; InvalidArgument for a wrong kind, a missing method, or a name taken."""
         noun = self.noun
-        if not (isinstance(kind, type) and issubclass(kind, self._base)):
-            raise InvalidArgument(f"{noun}: expected a subclass of animat.{self._base.__name__}, got {shown(kind)}")
+        if not (isinstance(kind, type) and issubclass(kind, self.base)):
+            raise InvalidArgument(f"{noun}: expected a subclass of animat.{self.base.__name__}, got {shown(kind)}")
         place = place_of(kind)
         if missing := sorted(getattr(kind, "__abstractmethods__", ())):
             raise InvalidArgument(

@@ -180,7 +180,7 @@ def too_few_policies(n: int) -> str:
     """Why no difference can be found with so many policies per side; empty if one can."""
     smallest = p_of_u(0.0, n, n)
     policies = counted(n, "policy", "policies")
-    why = f"With {policies} per side p cannot fall below {smallest:.2g}, unless some have equal returns"
+    why = f"With {policies} per side p cannot fall below {smallest:.3g}, unless some have equal returns"
     return "" if smallest < LEVEL else why
 
 
