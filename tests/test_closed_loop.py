@@ -600,6 +600,8 @@ def test_a_loop_presents_as_the_policy_was_recorded_and_names_where_it_does_not(
     without.mapping = None  # type: ignore[assignment]
     with pytest.raises(UnusableData, match="through neurons"):
         Loop.of_policy(without, PERCENTILES)
+    with pytest.raises(InvalidArgument, match=f"conditions: expected {len(CONDITIONS)}, as the policy has, got 1"):
+        Loop.of_policy(RecordedAs(None), PERCENTILES, conditions=CONDITIONS[:1])
 
 
 @pytest.mark.parametrize(

@@ -155,6 +155,9 @@ def test_an_invalid_age_is_refused_before_anything_is_read(
         Origin(species="mouse")
     with pytest.raises(InvalidArgument, match="recorded_at: expected an ISO 8601 date"):
         Origin(recorded_at="yesterday")
+    # Bytes that are no UTF-8, from a command line.
+    with pytest.raises(InvalidArgument, match="lab: expected text without null characters or lone surrogates"):
+        Origin(lab=b"\xff".decode(errors="surrogateescape"))
 
 
 def test_spikes_without_traces_are_distinguished_from_a_damaged_file(

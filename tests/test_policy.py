@@ -6,6 +6,7 @@ import itertools
 import json
 import math
 import os
+import pickle
 import subprocess
 import sys
 from collections.abc import Callable
@@ -445,8 +446,9 @@ def test_what_was_checked_stays_as_it_is(tmp_path: Path) -> None:
         with pytest.raises(ValueError, match="read-only"):
             array[...] = 0.0
     policy.save(tmp_path / "p0.safetensors")
-    with pytest.raises(ValueError, match="read-only"):
-        Policy.load(tmp_path / "p0.safetensors").weights[0][0] = 1.0
+    for other in (Policy.load(tmp_path / "p0.safetensors"), pickle.loads(pickle.dumps(policy))):
+        with pytest.raises(ValueError, match="read-only"):
+            other.weights[0][0] = 1.0
 
 
 SWAPS = [{"chunk": 0, "recorded_at_min": 100.0}, {"chunk": 7, "recorded_at_min": 107.5}]

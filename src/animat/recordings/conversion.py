@@ -20,6 +20,7 @@ from animat.recordings.detection.settings import Detection
 from animat.recordings.findings import Finding, merged
 from animat.recordings.formats.hdf5_formats import open_traces
 from animat.recordings.formats.nwb import write_nwb
+from animat.recordings.formats.nwb_layout import expect_hdf5_text
 from animat.recordings.formats.with_spikeinterface import open_with_spikeinterface
 from animat.recordings.metadata import LIKE_A_DATE, culture_of, date_of
 from animat.recordings.raw import RawTraces
@@ -55,8 +56,8 @@ class Origin:
         experiment_description: what the experiment was for.
 
     Raises:
-        InvalidArgument: for a `species` that is not in Latin, an `age` that is not a duration, an `experimenter`
-            without a comma, or a `recorded_at` that is not a date.
+        InvalidArgument: for text that HDF5 cannot hold, a `species` that is not in Latin, an `age` that is not a
+            duration, an `experimenter` without a comma, or a `recorded_at` that is not a date.
     """
 
     subject_id: str | None = None
@@ -73,6 +74,8 @@ class Origin:
 
     def __post_init__(self) -> None:
         # Checked here rather than when the file is written, as spike detection takes minutes.
+        for name, text in vars(self).items():
+            expect_hdf5_text(name, text)
         checks: tuple[tuple[str, Callable[[str], object], str], ...] = (
             (
                 "species",

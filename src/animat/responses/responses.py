@@ -18,7 +18,7 @@ from animat.responses.condition import Condition
 from animat.responses.conditions import NO_CONDITION
 from animat.responses.readouts import ALL, Readouts
 from animat.stimulation.protocol import Presentation
-from animat.tables import briefly, freeze_one
+from animat.tables import briefly, freeze_one, reduce_dataclass
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -35,7 +35,7 @@ class Trials:
         set_up_s: seconds of setting up stimulation until then, which that clock leaves out; None: none.
     """
 
-    __repr__ = briefly
+    __repr__, __reduce__ = briefly, reduce_dataclass
 
     condition: Int64[np.ndarray, " presentations"]
     rate_hz: Float64[np.ndarray, " presentations"]
@@ -87,7 +87,7 @@ class Responses:
         UnusableData: for rates that are not finite.
     """
 
-    __repr__ = briefly
+    __repr__, __reduce__ = briefly, reduce_dataclass
 
     condition: Int64[np.ndarray, " responses"]
     rate_hz: Float64[np.ndarray, " responses"]

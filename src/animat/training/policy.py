@@ -33,7 +33,7 @@ from animat.responses.windows import check_window
 from animat.robots.base import LARGEST_SCALE, LEAST_SCALE, Robot
 from animat.robots.registry import REGISTRY as ROBOTS
 from animat.stimulation.protocol import Presentation
-from animat.tables import briefly, read_only_copy
+from animat.tables import briefly, read_only_copy, reduce_dataclass
 from animat.training.settings import PulseCost, check_provenance
 from animat.writing import write_whole
 
@@ -83,7 +83,7 @@ class Policy:
         best: the policy at its best assessment, after training; stored in a separate file in `best/`.
     """
 
-    __repr__ = briefly
+    __repr__, __reduce__ = briefly, reduce_dataclass
 
     weights: tuple[Float32[np.ndarray, "inputs outputs"], ...]
     biases: tuple[Float32[np.ndarray, " outputs"], ...]

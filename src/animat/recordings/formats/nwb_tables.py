@@ -17,7 +17,7 @@ from pynwb.file import Subject
 from pynwb.misc import Units
 
 from animat.errors import InvalidArgument
-from animat.recordings.formats.nwb_layout import FORMAT_VERSION, SUBJECT
+from animat.recordings.formats.nwb_layout import FORMAT_VERSION, SUBJECT, expect_hdf5_text
 from animat.recordings.metadata import LIKE_A_DATE, date_of, to_metadata
 from animat.recordings.recorded_culture import UNKNOWN_SUBJECT_ID
 from animat.recordings.recording import Channels, Recording
@@ -39,7 +39,9 @@ _FILE_KEYS = ("experiment_description", "lab", "institution")
 
 def nwb_file(recording: Recording, spike_counts: Int64[np.ndarray, " channels"]) -> NWBFile:
     """A recording as a pynwb object tree, with room for so many spikes of each channel, which the caller writes."""
-    texts = {_text("provenance", k): _text("provenance", v) for k, v in to_metadata(recording).items()}
+    texts = to_metadata(recording)
+    for text in (*texts, *texts.values()):
+        expect_hdf5_text("provenance", text)
     date = date_of(texts) if "recorded_at" in texts else UNKNOWN_DATE
     if date is None:
         got = texts["recorded_at"]
@@ -92,7 +94,7 @@ def _add_electrodes(nwb: NWBFile, channels: Channels) -> None:
         name="array", description="the recording electrodes", location="in vitro", device=device
     )
     rows = len(channels)
-    labels = [_text("channels.label", label) for label in channels.label]
+    labels = [expect_hdf5_text("channels.label", label) for label in channels.label]
     nwb.electrodes = ElectrodesTable(
         id=np.arange(rows),
         columns=[
@@ -168,14 +170,6 @@ def _recording_table(recording: Recording) -> DynamicTable:
     ]
     columns = [_column(name, description, [value]) for name, description, value in cells]
     return _table(DynamicTable, "animat_recording", "The scalars of the recording, one row.", columns)
-
-
-def _text(name: str, text: object) -> str:
-    """Text that HDF5 can hold."""
-    text = str(text)
-    if "\0" in text or any("\ud800" <= character <= "\udfff" for character in text):
-        raise InvalidArgument(f"{name}: expected text without null characters or lone surrogates, got {text!r}")
-    return text
 
 
 def _split(text: str, mark: str) -> list[str]:
