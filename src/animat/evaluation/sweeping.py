@@ -82,11 +82,12 @@ def bellman_backup(
     summed = np.empty(width, np.float32)
     landed = np.empty((n_landings, width), np.float32)
     worth = np.empty(n_nodes, np.float32)
-    follows = np.zeros((n_landings, n_layers), np.bool_)
+    # The layers that follow a landing, from the first to the last.
+    first_layer, end_layer = np.full(n_landings, n_layers), np.zeros(n_landings, np.int64)
     for layer in range(n_layers):
         for outcome in range(n_outcomes):
             k, then = outcomes[layer, outcome]
-            follows[k, then] = True
+            first_layer[k], end_layer[k] = min(first_layer[k], then), max(end_layer[k], then + 1)
     for row in range(n_rows):
         for k in range(n_landings):
             alive = False
@@ -100,20 +101,21 @@ def bellman_backup(
                     for j in range(width):
                         summed[j] = values[first * width + j]
                 else:
-                    summed[:] = f4(0)
+                    # Slices from 0 on: an index that could be negative would be checked each time.
+                    begin, length = first_layer[k] * n_nodes, (end_layer[k] - first_layer[k]) * n_nodes
+                    sums = summed[begin : begin + length]
+                    sums[:] = f4(0)
                     for tap in range(0, n_taps, 4):
                         w0, w1 = tap_weights[tap], tap_weights[tap + 1]
                         w2, w3 = tap_weights[tap + 2], tap_weights[tap + 3]
-                        i0 = (first + row_offsets[tap]) * width
-                        i1 = (first + row_offsets[tap + 1]) * width
-                        i2 = (first + row_offsets[tap + 2]) * width
-                        i3 = (first + row_offsets[tap + 3]) * width
-                        v0, v1 = values[i0 : i0 + width], values[i1 : i1 + width]
-                        v2, v3 = values[i2 : i2 + width], values[i3 : i3 + width]
-                        for layer in range(n_layers):
-                            if follows[k, layer]:
-                                for j in range(layer * n_nodes, (layer + 1) * n_nodes):
-                                    summed[j] += (w0 * v0[j] + w1 * v1[j]) + (w2 * v2[j] + w3 * v3[j])
+                        i0 = (first + row_offsets[tap]) * width + begin
+                        i1 = (first + row_offsets[tap + 1]) * width + begin
+                        i2 = (first + row_offsets[tap + 2]) * width + begin
+                        i3 = (first + row_offsets[tap + 3]) * width + begin
+                        v0, v1 = values[i0 : i0 + length], values[i1 : i1 + length]
+                        v2, v3 = values[i2 : i2 + length], values[i3 : i3 + length]
+                        for j in range(length):
+                            sums[j] += (w0 * v0[j] + w1 * v1[j]) + (w2 * v2[j] + w3 * v3[j])
             for node in range(n_nodes):
                 at = nodes[k, row, node]
                 reward = rewards[k, row, node]
@@ -124,12 +126,11 @@ def bellman_backup(
                         landed[k, layer * n_nodes + node] = reward
                 else:
                     w0, w1, w2, w3 = cubic(places[k, row, node])
-                    for layer in range(n_layers):
-                        if follows[k, layer]:
-                            i = layer * n_nodes + at
-                            landed[k, layer * n_nodes + node] = reward + (
-                                (w0 * summed[i] + w1 * summed[i + 1]) + (w2 * summed[i + 2] + w3 * summed[i + 3])
-                            )
+                    for layer in range(first_layer[k], end_layer[k]):
+                        around = summed[layer * n_nodes + at : layer * n_nodes + at + 4]
+                        landed[k, layer * n_nodes + node] = reward + (
+                            (w0 * around[0] + w1 * around[1]) + (w2 * around[2] + w3 * around[3])
+                        )
         for layer in range(n_layers):
             start = row * width + layer * n_nodes
             row_best = best[start : start + n_nodes]
