@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -109,13 +109,29 @@ class MemorySimulator(EmpiricalSimulator):
 
     def rows_near(self, condition: Index, trace: Scalar, load: Scalar) -> tuple[Index, Index]:
         """The first row of `after_hz` to draw from for a trace and a load, and the row after the last."""
-        before, count, nearest = self.before[condition], self.followers[condition], self.nearest[condition]
+        count, nearest = self.followers[condition], self.nearest[condition]
         toward = jnp.asarray(self.toward)[condition]
         position = toward[0] * trace + toward[1] * load
-        smaller, no_larger = jnp.sum(before < position), jnp.sum(before <= position)
+        smaller = self._n_before(condition, lambda before: before < position)
+        no_larger = self._n_before(condition, lambda before: before <= position)
         first = jnp.clip((smaller + no_larger - nearest) // 2, 0, count - nearest)
         # Small arrays count few spikes, so many responses may have the same history.
         return jnp.minimum(first, smaller), jnp.maximum(first + nearest, no_larger)
+
+    def _n_before(self, condition: Index, comes_before: Callable[[Scalar], Array]) -> Array:
+        """The number of rows of a condition, the first ones, whose position comes before another one.
+
+        By bisection: to compare all rows, or to copy them as `jnp.searchsorted` does, takes many times as long. Not as
+        a loop of JAX's, of which a GPU would start every step by itself.
+        """
+        before = jnp.asarray(self.before)
+        length = before.shape[-1]
+        n: Array = jnp.int32(0)
+        for step in (1 << bit for bit in reversed(range(length.bit_length()))):
+            there = n + (step - 1)
+            is_more = (there < length) & comes_before(before[condition, jnp.minimum(there, length - 1)])
+            n = jnp.where(is_more, n + step, n)
+        return n
 
 
 @checked_arguments
