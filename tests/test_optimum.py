@@ -341,26 +341,29 @@ TO_CUBIC = np.linalg.inv(np.vander(np.arange(4.0), increasing=True))
 
 @pytest.mark.parametrize("left", [0, 7])
 def test_a_step_back_and_a_look_ahead_are_weighted_means_of_cubic_polynomials(left: int) -> None:
-    """Three axes of 5, 6 and 7 nodes, two layers, three landings, four outcomes and three actions, all at random."""
+    """Three axes of 5, 6 and 7 nodes, four layers, four landings, five outcomes and three actions, all at random."""
     rng = np.random.default_rng(left)
-    values = rng.normal(size=(30, 2, 7)).astype(np.float32)
-    rows = rng.choice([0, 1, 2, 6, 7, 8], (3, 30)).astype(np.int32)
-    nodes = rng.integers(-2, 4, (3, 30, 7), np.int32)
+    values = rng.normal(size=(30, 4, 7)).astype(np.float32)
+    rows = rng.choice([0, 1, 2, 6, 7, 8], (4, 30)).astype(np.int32)
+    nodes = rng.integers(-2, 4, (4, 30, 7), np.int32)
     # All nodes of a row may end.
     nodes[1, 4], nodes[2, 5:8] = -1, -2
     row_places, places, rewards = (
-        rng.uniform(1, 2, shape).astype(np.float32) for shape in ((3, 30, 2), nodes.shape, nodes.shape)
+        rng.uniform(1, 2, shape).astype(np.float32) for shape in ((4, 30, 2), nodes.shape, nodes.shape)
     )
     four = np.arange(4)
     offsets = (6 * four[:, None] + four).ravel().astype(np.int32)
-    # What leads to where no other outcome does has no weight in the second layer.
-    pairs = np.array([[[0, 0], [1, 1], [2, 0], [0, 1]], [[1, 0], [0, 1], [2, 0], [2, 1]]], np.int32)
-    weights = rng.dirichlet(np.ones(4), (2, 3)).astype(np.float32)
+    # The first landing leads to all layers, the second to two with another between them, the third to the last two, one
+    # of them by an outcome without weight, and the fourth to none.
+    landing = [[0, 1, 2, 0, 1], [1, 0, 2, 2, 1], [0, 1, 2, 1, 0], [1, 2, 0, 0, 1]]
+    then = [[0, 1, 2, 3, 3], [3, 1, 2, 3, 1], [2, 1, 2, 3, 0], [1, 2, 3, 0, 3]]
+    pairs = np.stack([landing, then], axis=-1).astype(np.int32)
+    weights = rng.dirichlet(np.ones(5), (4, 3)).astype(np.float32)
     weights[1, :, 3] = 0
 
     of_axes = [(each[..., None].astype(float) ** four) @ TO_CUBIC for each in (row_places, places)]
     around = values[(rows[..., None] + offsets)[:, :, None, :, None], :, np.maximum(nodes, 0)[..., None, None] + four]
-    cubes = around.reshape(3, 30, 7, 4, 4, 4, 2)
+    cubes = around.reshape(4, 30, 7, 4, 4, 4, 4)
     reached = np.einsum("kra,krb,krnc,krnabcl->krnl", of_axes[0][:, :, 0], of_axes[0][:, :, 1], of_axes[1], cubes)
     reached[nodes < 0] = 0
     reached[nodes == -2] = places[nodes == -2][:, None] if left else 0
@@ -374,7 +377,7 @@ def test_a_step_back_and_a_look_ahead_are_weighted_means_of_cubic_polynomials(le
     assert wanted.min() < ends[0] and wanted.max() > ends[1]
     np.testing.assert_allclose(best, np.clip(wanted, *ends), atol=1e-5)
     chosen = np.zeros(30, np.int32)
-    for layer, node in np.ndindex(2, 7):
+    for layer, node in np.ndindex(4, 7):
         there = rows.copy(), row_places.copy(), *(np.ascontiguousarray(each[..., node]) for each in landings[2:])
         # As arrays of JAX are.
         for each in there:

@@ -361,6 +361,9 @@ def test_positions_in_another_unit_cause_a_warning(unit: float, is_wrong: bool) 
     for table in (channels, line):
         found = {each.name for each in recording_findings(replace(source, channels=table))}
         assert ("positions-not-in-um" in found) == is_wrong
+    # Sixteen units of one electrode.
+    of_one = replace(source.channels, electrode=np.zeros(16, np.int64), x_um=np.zeros(16), y_um=np.zeros(16))
+    assert "positions-not-in-um" not in {f.name for f in recording_findings(replace(source, channels=of_one))}
 
 
 def test_a_single_unit_that_is_refractory_has_no_coarse_times() -> None:

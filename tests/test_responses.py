@@ -143,8 +143,9 @@ def test_responses_refuse_columns_that_do_not_belong_together() -> None:
     with pytest.raises(Mismatch, match="expected indices of 0 conditions"):
         Responses(some.condition, some.rate_hz, some.active_ratio, some.is_burst, (), (2, 10), 4, 0.0, 0.0)
     for each in (some, pickle.loads(pickle.dumps(some))):
-        with pytest.raises(ValueError, match="read-only"):
-            each.rate_hz[0] = 1
+        for column in (each.rate_hz, each.presented.rate_hz):
+            with pytest.raises(ValueError, match="read-only"):
+                column[0] = 1
 
 
 @pytest.mark.parametrize("window_ms", [(10.0, 2.0), (5.0, 5.0), (-1.0, 5.0), (0.0, float("inf")), (float("nan"), 1.0)])

@@ -537,14 +537,44 @@ def test_other_nwb_stimuli_in_series(tmp_path: Path, name: str, times_s: list[fl
         assert read_hdf5(path).stimuli.time_s.tolist() == [0.1, 0.2, 0.3]
 
 
-def test_every_entry_of_a_series_is_a_stimulus_if_its_data_are_not_one_number_each(tmp_path: Path) -> None:
+def test_every_entry_of_a_series_is_a_stimulus_if_its_data_are_no_numbers(tmp_path: Path) -> None:
     path = other_nwb(tmp_path / "a.nwb", stimuli=("events",))
-    for data in (np.zeros((3, 2)), None):
+    for data, times_s in (
+        (np.zeros((3, 2)), [0.1, 0.2, 0.3]),
+        (np.array([[0.0, 0.0], [0.0, 1.0], [2.0, 0.0]]), [0.2, 0.3]),
+        (np.array([[0.0], [1.0], [0.0]]), [0.2]),
+        (np.ones((3, 2, 2)), [0.1, 0.2, 0.3]),
+        (None, [0.1, 0.2, 0.3]),
+    ):
         with h5py.File(path, "r+") as file:
             del file["stimulus/presentation/events/data"]
             if data is not None:
                 file["stimulus/presentation/events/data"] = data
-        assert read_hdf5(path).stimuli.time_s.tolist() == [0.1, 0.2, 0.3]
+        assert read_hdf5(path).stimuli.time_s.tolist() == times_s
+
+
+@pytest.mark.parametrize("before", [8, 0])
+@pytest.mark.parametrize("shape", [(-1,), (-1, 1)])
+def test_samples_that_are_kept_around_pulses_only_are_sampled(
+    before: int, shape: tuple[int, ...], tmp_path: Path
+) -> None:
+    """Each of their samples was a pulse. Without samples before and after, one's end was taken for the next one's."""
+    path, pulse_s = other_nwb(tmp_path / "a.nwb", stimuli=("events",)), np.arange(0.1, 1.0, 0.2)
+    snippet = np.pad([1.0, 1.0, -1.0, -1.0], before)
+    times_s = pulse_s[:, None] + (np.arange(len(snippet)) - before) / 2000
+    with h5py.File(path, "r+") as file:
+        del file["stimulus/presentation/events/data"], file["stimulus/presentation/events/timestamps"]
+        file["stimulus/presentation/events/data"] = np.tile(snippet, len(pulse_s)).reshape(shape)
+        file["stimulus/presentation/events/timestamps"] = times_s.ravel()
+    np.testing.assert_allclose(read_hdf5(path).stimuli.time_s, pulse_s)
+
+
+def test_a_recording_began_at_the_time_that_its_times_count_from(tmp_path: Path) -> None:
+    path = other_nwb(tmp_path / "a.nwb")
+    assert read_hdf5(path).recorded_at == datetime.datetime(2024, 1, 1, tzinfo=datetime.UTC)
+    with h5py.File(path, "r+") as file:
+        file["timestamps_reference_time"][()] = "2024-01-01T01:00:00+00:00"
+    assert read_hdf5(path).recorded_at == datetime.datetime(2024, 1, 1, 1, tzinfo=datetime.UTC)
 
 
 @pytest.mark.oracle
@@ -557,6 +587,7 @@ def test_every_entry_of_a_series_is_a_stimulus_if_its_data_are_not_one_number_ea
         ("steps of a converter", [0.1, 0.5, 0.9]),
         ("an offset", [0.1, 0.5, 0.9]),
         ("samples 2 ms apart", [0.1, 0.5, 0.9]),
+        ("a column", [0.1, 0.5, 0.9]),
     ],
 )
 def test_a_sampled_stimulus_begins_each_time_it_leaves_0(
@@ -580,12 +611,16 @@ def test_a_sampled_stimulus_begins_each_time_it_leaves_0(
     data = data != 0 if of == "true and false" else data
     with pynwb.NWBHDF5IO(str(path), "a") as nwb_io:
         nwb = nwb_io.read()
-        stored: dict[str, object] = {"data": data}
+        stored: dict[str, object] = {"data": data[:, None] if of == "a column" else data}
         if of == "an offset":
             # As a converter from analog to digital: 2048 is 0.
             stored = {"data": (data + 2048).astype(np.uint16), "conversion": 0.1, "offset": -204.8}
         nwb.add_stimulus(pynwb.TimeSeries(name="wave", rate=float(rate_hz), starting_time=0.0, unit="mV", **stored))
-        wave = {**stored, "data": np.take(stored["data"], [900, 950, 1000], mode="clip"), "timestamps": [0.1, 0.2, 0.3]}
+        wave = {
+            **stored,
+            "data": np.take(stored["data"], [900, 950, 1000], axis=0, mode="clip"),
+            "timestamps": [0.1, 0.2, 0.3],
+        }
         nwb.add_acquisition(pynwb.TimeSeries(name="each", unit="mV", **wave))
         nwb.add_acquisition(
             pynwb.TimeSeries(name="timed", unit="mV", timestamps=3.0 + np.arange(rate_hz) / rate_hz, **stored)
@@ -596,6 +631,23 @@ def test_a_sampled_stimulus_begins_each_time_it_leaves_0(
         np.testing.assert_allclose(read_hdf5(path, stimuli="timed").stimuli.time_s, 3.0 + np.array(times_s))
     if of not in ("noise", "steps of a converter", "samples 2 ms apart"):
         np.testing.assert_allclose(read_recording(path, stimuli="each").stimuli.time_s, [0.3])
+
+
+def test_stimuli_are_found_in_what_holds_behavioural_series(tmp_path: Path) -> None:
+    import pynwb
+
+    path = other_nwb(tmp_path / "a.nwb", stimuli=())
+    with pytest.raises(InvalidFile, match="stimuli: nothing in the file can be stimuli, got pulses"):
+        read_hdf5(path, stimuli="pulses")
+    with pynwb.NWBHDF5IO(str(path), "a") as nwb_io:
+        nwb = nwb_io.read()
+        module = nwb.create_processing_module(name="behavior", description="x")
+        for name, times_s in (("pulses", [0.1, 0.3]), ("licks", [0.2])):
+            series = pynwb.TimeSeries(name=name, data=np.ones(len(times_s)), timestamps=times_s, unit="n/a")
+            module.add(pynwb.behavior.BehavioralTimeSeries(name=f"of {name}", time_series=series))
+        nwb_io.write(nwb)
+    assert read_hdf5(path).stimuli.time_s.tolist() == [0.1, 0.3]
+    assert read_hdf5(path, stimuli="licks").stimuli.time_s.tolist() == [0.2]
 
 
 def test_other_nwb_with_several_stimuli_lists_them(tmp_path: Path) -> None:

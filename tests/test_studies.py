@@ -609,20 +609,34 @@ def test_the_example_of_the_page_runs(
 
 @pytest.mark.oracle
 @pytest.mark.filterwarnings("ignore::ResourceWarning")
-def test_no_table_or_figure_is_cut_off_in_print(finished: Path, browser: Any) -> None:
-    """Tables that scroll on a screen lost their last columns on paper."""
+def test_no_table_or_figure_is_cut_off_in_print(browser: Any, finished: Path) -> None:
+    """Tables that scroll on a screen lost their last columns on paper, and folded ones all of them."""
     browser.get((finished / "report.html").as_uri())
-    cut_off = "return [...document.querySelectorAll('.wide > *')].filter(each => {where}).length"
-    scrolling = cut_off.format(where="getComputedStyle(each.parentElement).overflowX !== 'visible'")
-    beyond = cut_off.format(where="each.getBoundingClientRect().right > innerWidth")
-    assert browser.execute_script(scrolling) > 10
-    # The width of A4 in landscape, less margins of a centimetre.
-    size = {"width": 1046, "height": 718, "deviceScaleFactor": 1, "mobile": False}
-    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+
+    def size(width_px: int, height_px: int) -> None:
+        asked = {"width": width_px, "height": height_px, "deviceScaleFactor": 1, "mobile": False}
+        browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", asked)
+
+    def number_of(css: str, which: str) -> int:
+        script = f"return [...document.querySelectorAll('{css}')].filter(each => {which}).length"
+        return int(browser.execute_script(script))
+
+    # As a long table is.
+    browser.execute_script(
+        "const table = document.querySelector('.wide:has(table)'), folded = document.createElement('details');"
+        "table.replaceWith(folded); folded.append(table)"
+    )
+    size(700, 900)
+    assert number_of(".wide", "each.scrollWidth > each.clientWidth") > 3
+    assert number_of("table", "!each.checkVisibility()") == 1
+    # A4 in landscape, less margins of a centimetre.
+    size(1046, 718)
     browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "print"})
-    assert (browser.execute_script(scrolling), browser.execute_script(beyond)) == (0, 0)
-    tallest = "return Math.max(...[...document.querySelectorAll('figure')].map(each => each.offsetHeight))"
-    assert browser.execute_script(tallest) < size["height"]
+    assert number_of(".wide", "each.scrollWidth > each.clientWidth") == 0
+    assert number_of("table, figure img", "true") > 20
+    beyond = "each.getBoundingClientRect().right > innerWidth"
+    assert number_of("table, figure img", f"{beyond} || !each.checkVisibility()") == 0
+    assert number_of("figure", "each.offsetHeight > innerHeight") == 0
 
 
 @pytest.mark.oracle

@@ -11,6 +11,7 @@ import pytest
 from animat.cli import main
 from animat.errors import InvalidFile
 from animat.training.specification import CHUNKS
+from animat.tuning.results import describe_settings
 from animat.tuning.search import JOURNAL, read_journal
 from animat.tuning.specification import Range, Tune, own_settings, read_tuning, with_settings
 
@@ -146,3 +147,12 @@ def test_a_journal_with_a_return_that_is_no_finite_number_is_refused(tmp_path: P
     (tmp_path / JOURNAL).write_text(line + "\n")
     with pytest.raises(InvalidFile, match=r"journal\.jsonl: .*returns: expected a (finite )?number.*remove it to run"):
         read_journal(tmp_path)
+
+
+def test_settings_are_shown_with_the_digits_that_matter() -> None:
+    """The search goes by how far a discount is from 1: all above 0.9985 were shown as 0.999 or 1."""
+    settings = {"discount": 0.99971234, "learning_rate": 0.00123456, "conditions": "", "batch": 64}
+    shown = describe_settings(settings)
+    for each in ("discount 0.999712", "learning_rate 0.00123", 'conditions ""', "batch 64"):
+        assert each in shown.split(", ")
+    assert describe_settings({"discount": 0.99}) == "discount 0.99"

@@ -95,8 +95,13 @@ def expect_rising_times(name: str, times_s: Float64[np.ndarray, " times"]) -> No
 
 def reduce_dataclass(record: Any) -> tuple[Any, ...]:
     """A `__reduce__` for dataclasses with read-only arrays, which keeps them read-only when unpickled."""
-    values = (getattr(record, field.name) for field in fields(record))
-    return type(record), tuple(dict(value) if isinstance(value, MappingProxyType) else value for value in values)
+    values = {field.name: getattr(record, field.name) for field in fields(record) if field.init}
+    plain = {name: dict(value) if isinstance(value, MappingProxyType) else value for name, value in values.items()}
+    return _recreate, (type(record), plain)
+
+
+def _recreate(kind: type[Any], values: dict[str, Any]) -> Any:
+    return kind(**values)
 
 
 def briefly(record: Any) -> str:

@@ -82,7 +82,7 @@ def bellman_backup(
     summed = np.empty(width, np.float32)
     landed = np.empty((n_landings, width), np.float32)
     worth = np.empty(n_nodes, np.float32)
-    # The layers that follow a landing, from the first to the last.
+    # The layers that follow a landing, from the first to the last, with those between.
     first_layer, end_layer = np.full(n_landings, n_layers), np.zeros(n_landings, np.int64)
     for layer in range(n_layers):
         for outcome in range(n_outcomes):
@@ -101,7 +101,7 @@ def bellman_backup(
                     for j in range(width):
                         summed[j] = values[first * width + j]
                 else:
-                    # Slices from 0 on: an index that could be negative would be checked each time.
+                    # Slices from 0 on, as numba tests at each access whether another index is negative.
                     begin, length = first_layer[k] * n_nodes, (end_layer[k] - first_layer[k]) * n_nodes
                     sums = summed[begin : begin + length]
                     sums[:] = f4(0)

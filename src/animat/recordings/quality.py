@@ -155,7 +155,10 @@ def _on_channels(recording: Recording) -> Iterator[Finding]:
 def _impossible_positions(recording: Recording) -> Iterator[Finding]:
     """A finding on positions between which no array has its electrodes."""
     channels = recording.channels
-    x_um, y_um = (axis[~np.isnan(axis)] for axis in (channels.x_um, channels.y_um))
+    # Several channels may be units of one electrode.
+    _, first = np.unique(channels.electrode, return_index=True)
+    kept = np.union1d(first[channels.electrode[first] >= 0], np.flatnonzero(channels.electrode < 0))
+    x_um, y_um = (axis[kept][~np.isnan(axis[kept])] for axis in (channels.x_um, channels.y_um))
     if len(x_um) < SEVERAL or len(x_um) != len(y_um):
         return
     width_um, height_um = float(np.ptp(x_um)), float(np.ptp(y_um))

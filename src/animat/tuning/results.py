@@ -148,9 +148,12 @@ def draw_importance(shares: Mapping[str, float], title: str) -> Figure:
 
 
 def describe_settings(settings: Mapping[str, Any]) -> str:
-    """Settings in one line, with three significant digits."""
+    """Settings in one line, with three significant digits, of a discount those of its distance from 1."""
     ordered = sorted(settings, key=lambda name: (name not in THROUGH_NEURONS, SEARCHABLE.index(name)))
-    return ", ".join(
-        f"{name} {value:.3g}" if isinstance(value, float) else f"{name} {value}"
-        for name, value in ((name, settings[name]) for name in ordered)
-    )
+    return ", ".join(f"{name} {_shown(name, settings[name])}" for name in ordered)
+
+
+def _shown(name: str, value: Any) -> str:
+    if name == "discount":
+        return f"{1 - float(f'{1 - value:.3g}'):.12g}"
+    return f"{value:.3g}" if isinstance(value, float) else str(value) or '""'

@@ -135,7 +135,9 @@ def _labels(file: Hdf5File, at: str, columns: tuple[str, ...], n: int) -> Column
 
 def _origin(file: Hdf5File) -> dict[str, str]:
     """Who recorded what, as far as the file states it."""
-    texts: dict[str, Any] = {"recorded_at": _text(file, "session_start_time")}
+    # All times in the file count from the reference.
+    began = _text(file, "timestamps_reference_time") or _text(file, "session_start_time")
+    texts: dict[str, Any] = {"recorded_at": began}
     texts |= {name: _text(file, f"general/{name}") for name in TEXTS}
     texts["session_description"] = _text(file, "session_description") or texts["session_description"]
     texts |= {key: _text(file, f"general/subject/{name}") for name, key in SUBJECT.items()}

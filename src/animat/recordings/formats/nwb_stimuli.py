@@ -61,14 +61,19 @@ def read_stimuli(file: Hdf5File, asked: str | None, findings: list[Finding]) -> 
 def _find_stimuli(file: Hdf5File, asked: str | None, findings: list[Finding]) -> str | None:
     """Where the stimuli are: where asked, in /stimulus/presentation, or elsewhere under a name that mentions them."""
     first = [f"{FIRST}/{name}" for name in file.names(FIRST)]
-    elsewhere = [f"{room}/{name}" for room in ELSEWHERE for name in file.names(room)]
-    elsewhere += [f"processing/{m}/{name}" for m in file.names("processing") for name in file.names(f"processing/{m}")]
+    rooms = [*ELSEWHERE, *(f"processing/{module}" for module in file.names("processing"))]
+    elsewhere = [f"{room}/{name}" for room in rooms for name in file.names(room)]
+    # What holds series, such as BehavioralEvents.
+    holders = [at for at in elsewhere if str(file.attribute(at, "neurodata_type")).startswith("Behavioral")]
+    elsewhere += [f"{holder}/{name}" for holder in holders for name in file.names(holder)]
     first, elsewhere = ([at for at in places if _can_be_stimuli(file, at)] for places in (first, elsewhere))
     if asked is not None:
         every = [*first, *elsewhere]
         named = [at for at in every if asked.strip("/") in (at, at.rpartition("/")[2])]
+        if not every:
+            raise InvalidFile(f"{file.path}: stimuli: nothing in the file can be stimuli, got {asked}")
         if not named:
-            choose(f"{file.path}: stimuli", "--stimuli", every or ["none (nothing in the file can be stimuli)"], asked)
+            choose(f"{file.path}: stimuli", "--stimuli", every, asked)
         return choose(f"{file.path}: stimuli named {asked}", "--stimuli", named, None)
     named = [at for at in elsewhere if STIMULUS_NAME.search(at.rpartition("/")[2])]
     candidates = first or named or [at for at in elsewhere if _onset_column(file, at) is not None]
@@ -191,18 +196,22 @@ def _from_series(file: Hdf5File, at: str) -> Column:
         time_s = file.read(f"{at}/timestamps").reshape(-1)
         node, kind = file.node(f"{at}/data"), file.attribute(at, "neurodata_type")
         # In an IndexSeries, 0 is the first of the things that are presented.
-        if not isinstance(node, h5py.Dataset) or node.shape != time_s.shape or kind == "IndexSeries":
+        of_times = isinstance(node, h5py.Dataset) and node.ndim <= 2 and node.shape[:1] == time_s.shape
+        if not of_times or kind == "IndexSeries":
             return time_s
         data = file.read(f"{at}/data")
         if data.dtype.kind == "U":
             return time_s
-        step_s = float(np.ptp(time_s)) / len(time_s) if len(time_s) else 0.0
+        # Of snippets around pulses, too.
+        step_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
         # Sampled, though it states no rate.
         if kind != "IntervalSeries" and 0 < step_s < APART_S:
-            return np.asarray(time_s[_onsets(file, f"{at}/data", 1 / step_s).astype(np.int64)])
+            return np.asarray(time_s[_onsets(file, f"{at}/data", 1 / step_s, time_s).astype(np.int64)])
         # Where a digital input is recorded, a negative number is the end of a pulse.
         has_ends = kind == "IntervalSeries" or (data.dtype.kind == "i" and not at.startswith(FIRST))
         is_pulse = data > 0 if has_ends and np.any(data > 0) else _from_zero(file, f"{at}/data", data) != 0
+        # In several columns, where any is not 0.
+        is_pulse = is_pulse.reshape(len(time_s), -1).any(axis=1)
         return np.asarray(time_s[is_pulse] if np.any(is_pulse) else time_s)
     rate_hz, start_s = file.attribute(f"{at}/starting_time", "rate"), file.first(f"{at}/starting_time")
     if not is_positive(rate_hz) or not isinstance(start_s, int | float):
@@ -210,21 +219,22 @@ def _from_series(file: Hdf5File, at: str) -> Column:
     return np.asarray(start_s + _onsets(file, f"{at}/data", float(rate_hz)) / rate_hz)
 
 
-def _onsets(file: Hdf5File, at: str, rate_hz: float) -> Column:
-    """The samples at which a stimulus leaves 0, for the first time in 1 ms.
+def _onsets(file: Hdf5File, at: str, rate_hz: float, time_s: Column | None = None) -> Column:
+    """The samples at which a stimulus leaves 0, for the first time in 1 ms; without times all are equally far apart.
 
     If most samples are exactly 0, away from it is more than a hundredth of its largest magnitude: a converter from
     analog to digital is off by a step or two now and then. Otherwise there is more noise, and it is more than half.
     Samples are read in blocks, as they may be as many as the recording's.
     """
     dataset = file.dataset(at)
-    if dataset.ndim != 1 or dataset.dtype.kind not in "iufb" or dataset.size > 8 * (file.path.stat().st_size + 10**6):
+    is_column = dataset.ndim in (1, 2) and dataset.size == len(dataset)
+    if not is_column or dataset.dtype.kind not in "iufb" or dataset.size > 8 * (file.path.stat().st_size + 10**6):
         raise InvalidFile(f"{file.path}: expected one column of numbers at /{at}, got {dataset.dtype} {dataset.shape}")
     blocks = range(0, len(dataset), _BLOCK)
 
     def magnitude(b: int) -> Column:
         # Samples that are not known (NaN) are no stimulus.
-        return np.asarray(np.abs(np.nan_to_num(_from_zero(file, at, dataset[b : b + _BLOCK]))))
+        return np.asarray(np.abs(np.nan_to_num(_from_zero(file, at, dataset[b : b + _BLOCK].reshape(-1)))))
 
     largest, n_zeros = 0.0, 0
     for b in blocks:
@@ -234,7 +244,8 @@ def _onsets(file: Hdf5File, at: str, rate_hz: float) -> Column:
         return np.empty(0)
     least = largest / (100 if n_zeros > len(dataset) / 2 else 2)
     samples = np.concatenate([np.flatnonzero(magnitude(b) > least) + b for b in blocks])
-    return np.asarray(samples[np.diff(samples, prepend=-(2**62)) > max(1, APART_S * rate_hz)])
+    apart = np.diff(samples) if time_s is None else np.rint(np.diff(time_s[samples]) * rate_hz)
+    return np.asarray(samples[np.append(True, apart > max(1, APART_S * rate_hz))])
 
 
 def _from_zero(file: Hdf5File, at: str, data: Column) -> Column:
