@@ -544,6 +544,7 @@ def test_every_entry_of_a_series_is_a_stimulus_if_its_data_are_no_numbers(tmp_pa
         (np.array([[0.0, 0.0], [0.0, 1.0], [2.0, 0.0]]), [0.2, 0.3]),
         (np.array([[0.0], [1.0], [0.0]]), [0.2]),
         (np.ones((3, 2, 2)), [0.1, 0.2, 0.3]),
+        (np.ones(2), [0.1, 0.2, 0.3]),
         (None, [0.1, 0.2, 0.3]),
     ):
         with h5py.File(path, "r+") as file:
@@ -551,6 +552,12 @@ def test_every_entry_of_a_series_is_a_stimulus_if_its_data_are_no_numbers(tmp_pa
             if data is not None:
                 file["stimulus/presentation/events/data"] = data
         assert read_hdf5(path).stimuli.time_s.tolist() == times_s
+    for empty in (np.zeros(0), np.zeros((0, 2))):
+        with h5py.File(path, "r+") as file:
+            for name, values in (("data", empty), ("timestamps", np.zeros(0))):
+                _ = file.pop(f"stimulus/presentation/events/{name}", None)
+                file[f"stimulus/presentation/events/{name}"] = values
+        assert len(read_hdf5(path).stimuli) == 0
 
 
 @pytest.mark.parametrize("before", [8, 0])

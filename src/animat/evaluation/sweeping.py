@@ -101,7 +101,7 @@ def bellman_backup(
                     for j in range(width):
                         summed[j] = values[first * width + j]
                 else:
-                    # Slices from 0 on, as numba tests at each access whether another index is negative.
+                    # Slices that begin at 0: an index that could be negative is tested at each access.
                     begin, length = first_layer[k] * n_nodes, (end_layer[k] - first_layer[k]) * n_nodes
                     sums = summed[begin : begin + length]
                     sums[:] = f4(0)

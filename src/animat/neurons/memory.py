@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import ClassVar
 
 import jax
@@ -112,26 +113,29 @@ class MemorySimulator(EmpiricalSimulator):
         count, nearest = self.followers[condition], self.nearest[condition]
         toward = jnp.asarray(self.toward)[condition]
         position = toward[0] * trace + toward[1] * load
-        smaller = self._n_before(condition, lambda before: before < position)
-        no_larger = self._n_before(condition, lambda before: before <= position)
+        before = jnp.asarray(self.before)
+        smaller, no_larger = (_n_before(before, condition, position, or_there=each) for each in (False, True))
         first = jnp.clip((smaller + no_larger - nearest) // 2, 0, count - nearest)
         # Small arrays count few spikes, so many responses may have the same history.
         return jnp.minimum(first, smaller), jnp.maximum(first + nearest, no_larger)
 
-    def _n_before(self, condition: Index, comes_before: Callable[[Scalar], Array]) -> Array:
-        """The number of rows of a condition, the first ones, whose position comes before another one.
 
-        By bisection: to compare all rows, or to copy them as `jnp.searchsorted` does, takes many times as long. Not as
-        a loop of JAX's, of which a GPU would start every step by itself.
-        """
-        before = jnp.asarray(self.before)
-        length = before.shape[-1]
-        n: Array = jnp.int32(0)
-        for step in (1 << bit for bit in reversed(range(length.bit_length()))):
-            there = n + (step - 1)
-            is_more = (there < length) & comes_before(before[condition, jnp.minimum(there, length - 1)])
-            n = jnp.where(is_more, n + step, n)
-        return n
+# Under `jit`, so that it is traced once and not in every program that uses it.
+@partial(jax.jit, static_argnames="or_there")
+def _n_before(before: Float[Stored, "conditions values"], condition: Index, position: Scalar, or_there: bool) -> Index:
+    """The number of a condition's rows, the first ones, whose position is before a given one, or before it or there.
+
+    By bisection: to compare all rows, or to copy them as `jnp.searchsorted` does, takes many times as long. Not as a
+    loop of JAX's, of which a GPU would start every step by itself.
+    """
+    length = before.shape[-1]
+    n: Array = jnp.int32(0)
+    for step in (1 << bit for bit in reversed(range(length.bit_length()))):
+        middle = n + (step - 1)
+        value = before[condition, jnp.minimum(middle, length - 1)]
+        is_before = value <= position if or_there else value < position
+        n = jnp.where((middle < length) & is_before, n + step, n)
+    return n
 
 
 @checked_arguments

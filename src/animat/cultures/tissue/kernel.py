@@ -210,7 +210,7 @@ def arrive(constants: np.record, state: TissueState, arrivals: Arrivals, slot: i
 @inlined
 def over_threshold(constants: np.record, state: TissueState, first: int, last: int) -> np.int32:
     """Number of neurons from `first` up to `last` above threshold; refractory ones are at the reset potential."""
-    # Slices from 0 on, as numba tests at each access whether another index is negative, which is no vector code.
+    # Slices that begin at 0: an index that could be negative is tested at each access, and its loop not vectorised.
     v_mv, adaptation_mv, threshold_mv = state.v_mv[first:last], state.adaptation_mv[first:last], constants.threshold_mv
     count = np.int32(0)
     for i in range(v_mv.size):

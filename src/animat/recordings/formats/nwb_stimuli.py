@@ -211,7 +211,7 @@ def _from_series(file: Hdf5File, at: str) -> Column:
         has_ends = kind == "IntervalSeries" or (data.dtype.kind == "i" and not at.startswith(FIRST))
         is_pulse = data > 0 if has_ends and np.any(data > 0) else _from_zero(file, f"{at}/data", data) != 0
         # In several columns, where any is not 0.
-        is_pulse = is_pulse.reshape(len(time_s), -1).any(axis=1)
+        is_pulse = is_pulse.any(axis=1) if is_pulse.ndim > 1 else is_pulse
         return np.asarray(time_s[is_pulse] if np.any(is_pulse) else time_s)
     rate_hz, start_s = file.attribute(f"{at}/starting_time", "rate"), file.first(f"{at}/starting_time")
     if not is_positive(rate_hz) or not isinstance(start_s, int | float):
