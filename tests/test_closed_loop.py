@@ -602,6 +602,8 @@ def test_a_loop_presents_as_the_policy_was_recorded_and_names_where_it_does_not(
         Loop.of_policy(without, PERCENTILES)
     with pytest.raises(InvalidArgument, match=f"conditions: expected {len(CONDITIONS)}, as the policy has, got 1"):
         Loop.of_policy(RecordedAs(None), PERCENTILES, conditions=CONDITIONS[:1])
+    with pytest.raises(InvalidArgument, match="conditions: expected several of: a Condition, got 5"):
+        Loop.of_policy(RecordedAs(None), PERCENTILES, conditions=5)
 
 
 @pytest.mark.parametrize(

@@ -537,7 +537,7 @@ def test_other_nwb_stimuli_in_series(tmp_path: Path, name: str, times_s: list[fl
         assert read_hdf5(path).stimuli.time_s.tolist() == [0.1, 0.2, 0.3]
 
 
-def test_every_entry_of_a_series_is_a_stimulus_if_its_data_are_no_numbers(tmp_path: Path) -> None:
+def test_entries_of_a_series_are_stimuli_unless_their_numbers_are_0(tmp_path: Path) -> None:
     path = other_nwb(tmp_path / "a.nwb", stimuli=("events",))
     for data, times_s in (
         (np.zeros((3, 2)), [0.1, 0.2, 0.3]),

@@ -197,10 +197,10 @@ class Loop:
             pulses = 1 if recorded is None else recorded.pulses
         window_ms = policy.window_ms or DEFAULT_WINDOW_MS
         settings = {"conditions": policy.conditions, "window_ms": window_ms, "readouts": policy.readouts, **settings}
-        if (n := len(settings["conditions"])) != len(policy.conditions):
-            raise InvalidArgument(f"conditions: expected {len(policy.conditions)}, as the policy has, got {n}")
         percentiles = np.asarray(percentiles, np.float32)
         loop = cls(policy.robot, policy.mapping, percentiles=percentiles, pulses=pulses, **settings)
+        if (n := len(loop.conditions)) != len(policy.conditions):
+            raise InvalidArgument(f"conditions: expected {len(policy.conditions)}, as the policy has, got {n}")
         findings = list(other_presentation(recorded, loop.presentation))
         if policy.window_ms not in (None, loop.window_ms):
             trained, read = describe_window(policy.window_ms), describe_window(loop.window_ms)

@@ -114,27 +114,27 @@ class MemorySimulator(EmpiricalSimulator):
         toward = jnp.asarray(self.toward)[condition]
         position = toward[0] * trace + toward[1] * load
         before = jnp.asarray(self.before)
-        smaller, no_larger = (_n_before(before, condition, position, or_there=each) for each in (False, True))
+        smaller, no_larger = (_n_before(before, condition, position, or_equal=each) for each in (False, True))
         first = jnp.clip((smaller + no_larger - nearest) // 2, 0, count - nearest)
         # Small arrays count few spikes, so many responses may have the same history.
         return jnp.minimum(first, smaller), jnp.maximum(first + nearest, no_larger)
 
 
 # Under `jit`, so that it is traced once and not in every program that uses it.
-@partial(jax.jit, static_argnames="or_there")
-def _n_before(before: Float[Stored, "conditions values"], condition: Index, position: Scalar, or_there: bool) -> Index:
-    """The number of a condition's rows, the first ones, whose position is before a given one, or before it or there.
+@partial(jax.jit, static_argnames="or_equal")
+def _n_before(before: Float[Stored, "conditions values"], condition: Index, position: Scalar, or_equal: bool) -> Index:
+    """The number of a condition's rows, the first ones, whose position is below a given one, or equal to it too.
 
-    By bisection: to compare all rows, or to copy them as `jnp.searchsorted` does, takes many times as long. Not as a
-    loop of JAX's, of which a GPU would start every step by itself.
+    By bisection: comparing all rows, or copying them as `jnp.searchsorted` does, takes many times as long. Unrolled, as
+    a GPU would launch each step of a JAX loop separately.
     """
     length = before.shape[-1]
     n: Array = jnp.int32(0)
     for step in (1 << bit for bit in reversed(range(length.bit_length()))):
         middle = n + (step - 1)
         value = before[condition, jnp.minimum(middle, length - 1)]
-        is_before = value <= position if or_there else value < position
-        n = jnp.where((middle < length) & is_before, n + step, n)
+        is_below = value <= position if or_equal else value < position
+        n = jnp.where((middle < length) & is_below, n + step, n)
     return n
 
 
