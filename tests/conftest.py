@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import gc
 import importlib
 import itertools
@@ -151,6 +152,25 @@ def real_data() -> Path:
     folder = Path(os.environ.get("ANIMAT_REAL_DATA", Path(__file__).parents[2] / "shared" / "data"))
     if not folder.is_dir():
         pytest.skip(f"no real recordings at {folder}: set ANIMAT_REAL_DATA to the folder that holds them")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def tiny_study(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The finished folder of `tiny_study.toml`, run once for all workers of the tests, which leave it as it is."""
+    from animat.studies.run import run_study
+    from animat.studies.toml import read_study
+
+    own, file = tmp_path_factory.getbasetemp(), Path(__file__).parent / "tiny_study.toml"
+    common = own.parent if "PYTEST_XDIST_WORKER" in os.environ else own
+    folder, beside = common / "tiny_study", common / "tiny_study.partial"
+    with (common / "tiny_study.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not folder.exists():
+            # In this process, where its programs are compiled once.
+            with ThreadPoolExecutor(1) as executor:
+                run_study(read_study(file), beside, base=file.parent, executor=executor)
+            beside.rename(folder)
     return folder
 
 

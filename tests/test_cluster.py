@@ -403,16 +403,9 @@ def contents(out: Path) -> dict[str, bytes]:
     return {str(path.relative_to(out)): path.read_bytes() for path in among if path.is_file()}
 
 
-@pytest.fixture(scope="module")
-def without(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
-    out = tmp_path_factory.mktemp("without") / "study"
-    finish(out)
-    return contents(out)
-
-
 @oracle
 def test_a_study_is_the_same_bits_with_workers_and_clients_killed(
-    running: Running, without: dict[str, bytes], tmp_path: Path
+    running: Running, tiny_study: Path, tmp_path: Path
 ) -> None:
     out, on, rng = tmp_path / "study", ("--cluster", str(running.file)), random.Random(1)
     for of in ("worker", "client", "worker", "client"):
@@ -426,7 +419,7 @@ def test_a_study_is_the_same_bits_with_workers_and_clients_killed(
         process.kill()
         process.communicate()
     finish(out, *on)
-    assert contents(out) == without
+    assert contents(out) == contents(tiny_study)
 
 
 MAY_NOT = """
@@ -491,12 +484,10 @@ def test_without_a_shared_folder_files_go_along_and_come_back(elsewhere: Path, t
 
 
 @pytest.mark.long
-def test_without_a_shared_folder_a_study_is_the_same_bits(
-    without: dict[str, bytes], elsewhere: Path, tmp_path: Path
-) -> None:
+def test_without_a_shared_folder_a_study_is_the_same_bits(tiny_study: Path, elsewhere: Path, tmp_path: Path) -> None:
     out = tmp_path / "out" / "study"
     finish(out, "--cluster", str(elsewhere), "--no-shared-folder")
-    assert contents(out) == without
+    assert contents(out) == contents(tiny_study)
 
 
 @pytest.mark.long
@@ -534,7 +525,7 @@ def test_a_cluster_ends_where_its_scheduler_died_as_its_workers_began(
 
 
 @oracle
-def test_a_dead_scheduler_is_reported_and_the_same_command_continues(without: dict[str, bytes], tmp_path: Path) -> None:
+def test_a_dead_scheduler_is_reported_and_the_same_command_continues(tiny_study: Path, tmp_path: Path) -> None:
     out, file = tmp_path / "study", tmp_path / "cluster.json"
     with local_cluster(2, file) as (scheduler, _):
         process = started(out, "--cluster", str(file))
@@ -546,7 +537,7 @@ def test_a_dead_scheduler_is_reported_and_the_same_command_continues(without: di
     assert re.fullmatch(r"animat: .* has ended; start it, then run this again to continue", last(said))
     with local_cluster(2, file):
         finish(out, "--cluster", str(file))
-    assert contents(out) == without
+    assert contents(out) == contents(tiny_study)
 
 
 def last(said: str) -> str:

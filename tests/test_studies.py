@@ -72,15 +72,6 @@ NAMES = "arm, cartpole, detour, navigation, shuttle, swing-up, wheels"
 """Of the robots."""
 
 
-@pytest.fixture(scope="module")
-def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A tiny study, run in this process, where its programs are compiled once."""
-    folder = tmp_path_factory.mktemp("studies") / "tiny"
-    with ThreadPoolExecutor(1) as executor:
-        run_study(read_study(TINY), folder, base=TINY.parent, executor=executor)
-    return folder
-
-
 def files(folder: Path) -> dict[str, str]:
     """Every file of a folder, hidden ones too, with a digest."""
     return {
@@ -97,7 +88,7 @@ def rows(path: Path) -> list[dict[str, str]]:
 
 
 @pytest.mark.long
-def test_killed_again_and_again_with_one_worker_it_ends_in_the_same_files(finished: Path, tmp_path: Path) -> None:
+def test_killed_again_and_again_with_one_worker_it_ends_in_the_same_files(tiny_study: Path, tmp_path: Path) -> None:
     folder = tmp_path / "killed"
     # Between the recordings, after the simulators, with a policy that has no receipt yet, among the figures.
     moments = ("recordings/recording_0000_min.nwb", "jobs/fit.json", "policies/navigation/1-threshold/p0.safetensors",
@@ -109,15 +100,15 @@ def test_killed_again_and_again_with_one_worker_it_ends_in_the_same_files(finish
         assert process.poll() is None, f"it was over before {moment}"
         kill(process)
     assert subprocess.run(command_of_tiny(folder), stdout=subprocess.DEVNULL, check=False).returncode == 0
-    assert files(folder) == files(finished)
+    assert files(folder) == files(tiny_study)
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("seed", range(3))
-def test_killed_at_any_moment_it_ends_in_the_same_files(finished: Path, tmp_path: Path, seed: int) -> None:
+def test_killed_at_any_moment_it_ends_in_the_same_files(tiny_study: Path, tmp_path: Path, seed: int) -> None:
     rng = random.Random(seed)
     kill_and_go_on(tmp_path / "killed", [rng.uniform(3.0, 12.0) for _ in range(12)])
-    assert files(tmp_path / "killed") == files(finished)
+    assert files(tmp_path / "killed") == files(tiny_study)
 
 
 def kill_and_go_on(folder: Path, after_s: list[float]) -> None:
@@ -143,37 +134,39 @@ def kill(process: subprocess.Popen[bytes]) -> None:
 
 
 @pytest.mark.oracle
-def test_a_finished_folder_is_left_alone_and_said_to_be_so(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    before = {path: path.stat().st_mtime_ns for path in finished.rglob("*") if path.is_file()}
-    assert main(["study", str(TINY), "--out", str(finished), "--json"]) == 0
+def test_a_finished_folder_is_left_alone_and_said_to_be_so(
+    tiny_study: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = {path: path.stat().st_mtime_ns for path in tiny_study.rglob("*") if path.is_file()}
+    assert main(["study", str(TINY), "--out", str(tiny_study), "--json"]) == 0
     said = capsys.readouterr().out
     assert "nothing to do" in said
     assert json.loads(said.splitlines()[-1])["done_now_cpu_s"] == {}
-    assert {path: path.stat().st_mtime_ns for path in finished.rglob("*") if path.is_file()} == before
+    assert {path: path.stat().st_mtime_ns for path in tiny_study.rglob("*") if path.is_file()} == before
 
 
 @pytest.mark.oracle
 def test_what_is_lost_or_damaged_is_made_again_by_workers(
-    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tiny_study: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = tmp_path / "damaged"
-    shutil.copytree(finished, folder)
+    shutil.copytree(tiny_study, folder)
     (folder / "policies/navigation/1-threshold/p1.safetensors").write_bytes(b"damaged")
     (folder / "tables/scores.csv").unlink()
     assert main(["study", str(TINY), "--out", str(folder), "--workers", "2", "--json"]) == 0
     done_now = json.loads(capsys.readouterr().out.splitlines()[-1])["done_now_cpu_s"]
     assert set(done_now) == {"train/navigation/1-threshold/p0", "tables"}
-    assert files(folder) == files(finished)
+    assert files(folder) == files(tiny_study)
 
 
 @pytest.mark.oracle
-def test_a_folder_of_another_study_is_refused(finished: Path, tmp_path: Path) -> None:
-    before = files(finished)
+def test_a_folder_of_another_study_is_refused(tiny_study: Path, tmp_path: Path) -> None:
+    before = files(tiny_study)
     with pytest.raises(Mismatch, match=r"another \(study\.policies: 2 there, 3 now\)"):
-        run_study(replace(read_study(TINY), policies=3), finished, base=TINY.parent)
+        run_study(replace(read_study(TINY), policies=3), tiny_study, base=TINY.parent)
     with pytest.raises(Mismatch, match=r"another \(study\.seed: \d+ there, 99 now\)"):
-        run_study(replace(read_study(TINY), seed=99), finished, base=TINY.parent)
-    assert files(finished) == before
+        run_study(replace(read_study(TINY), seed=99), tiny_study, base=TINY.parent)
+    assert files(tiny_study) == before
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "thesis.txt").write_text("mine")
     with pytest.raises(Mismatch, match="other files in it"):
@@ -224,9 +217,9 @@ def test_nothing_of_another_s_folder_is_touched(tmp_path: Path) -> None:
 
 
 @pytest.mark.oracle
-def test_what_a_killed_run_was_writing_is_cleared_away_and_nothing_else(finished: Path, tmp_path: Path) -> None:
+def test_what_a_killed_run_was_writing_is_cleared_away_and_nothing_else(tiny_study: Path, tmp_path: Path) -> None:
     folder = tmp_path / "study"
-    shutil.copytree(finished, folder)
+    shutil.copytree(tiny_study, folder)
     unfinished = [".study.toml.abcd1234.partial.toml", "figures/.culture-psth.png.x_y_z_12.partial.png"]
     kept = ["figures/.my.partial.odt", "mine/.report.html.abcd1234.partial.html"]
     for name in (*unfinished, *kept):
@@ -238,15 +231,15 @@ def test_what_a_killed_run_was_writing_is_cleared_away_and_nothing_else(finished
 
 
 @pytest.mark.oracle
-def test_a_second_run_in_a_folder_at_work_is_refused(finished: Path) -> None:
-    with exclusive_lock(finished), pytest.raises(Mismatch, match="another run is at work in this folder"):
-        run_study(read_study(TINY), finished, base=TINY.parent)
-    assert run_study(read_study(TINY), finished, base=TINY.parent).done_now == {}
+def test_a_second_run_in_a_folder_at_work_is_refused(tiny_study: Path) -> None:
+    with exclusive_lock(tiny_study), pytest.raises(Mismatch, match="another run is at work in this folder"):
+        run_study(read_study(TINY), tiny_study, base=TINY.parent)
+    assert run_study(read_study(TINY), tiny_study, base=TINY.parent).done_now == {}
 
 
 @pytest.mark.oracle
 def test_a_finished_folder_that_cannot_be_written_to_is_still_finished(
-    finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tiny_study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     opened = Path.open
 
@@ -259,7 +252,7 @@ def test_a_finished_folder_that_cannot_be_written_to_is_still_finished(
         raise PermissionError(13, "Permission denied")
 
     folder = tmp_path / "archive"
-    shutil.copytree(finished, folder)
+    shutil.copytree(tiny_study, folder)
     leftover = folder / ".study.toml.abcd1234.partial.toml"
     leftover.write_text("half")
     with monkeypatch.context() as patch:
@@ -278,9 +271,9 @@ def test_a_finished_folder_that_cannot_be_written_to_is_still_finished(
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
 @pytest.mark.oracle
-def test_a_finished_read_only_folder_keeps_what_a_killed_run_left(finished: Path, tmp_path: Path) -> None:
+def test_a_finished_read_only_folder_keeps_what_a_killed_run_left(tiny_study: Path, tmp_path: Path) -> None:
     folder = tmp_path / "archive"
-    shutil.copytree(finished, folder)
+    shutil.copytree(tiny_study, folder)
     leftovers = [folder / ".study.toml.abcd1234.partial.toml", folder / "figures/.a.png.abcd1234.partial.png"]
     for leftover in leftovers:
         leftover.write_text("half")
@@ -331,9 +324,9 @@ def test_a_specification_can_be_corrected_after_its_first_job_was_stopped(
 
 @pytest.mark.parametrize("damage", ["fewer spikes", "garbage", "gone"])
 @pytest.mark.oracle
-def test_a_recording_that_changed_is_recorded_again(finished: Path, tmp_path: Path, damage: str) -> None:
+def test_a_recording_that_changed_is_recorded_again(tiny_study: Path, tmp_path: Path, damage: str) -> None:
     folder = tmp_path / "study"
-    shutil.copytree(finished, folder)
+    shutil.copytree(tiny_study, folder)
     file = folder / "recordings" / "recording_0000_min.nwb"
     if damage == "fewer spikes":
         recording = read_recording(file)
@@ -353,7 +346,7 @@ def test_a_recording_that_changed_is_recorded_again(finished: Path, tmp_path: Pa
     with ThreadPoolExecutor(1) as executor:
         ran = run_study(read_study(TINY), folder, base=TINY.parent, executor=executor)
     assert set(ran.done_now) == {"record"}
-    assert files(folder) == files(finished)
+    assert files(folder) == files(tiny_study)
 
 
 @pytest.mark.oracle
@@ -491,12 +484,12 @@ def episodes_in(folder: Path, **columns: str) -> list[dict[str, str]]:
 
 
 @pytest.mark.oracle
-def test_comparisons_are_what_scipy_makes_of_the_episodes(finished: Path) -> None:
-    (test,) = rows(finished / "tables/comparisons.csv")
+def test_comparisons_are_what_scipy_makes_of_the_episodes(tiny_study: Path) -> None:
+    (test,) = rows(tiny_study / "tables/comparisons.csv")
     means = []
     for arm in ("before training", "1 threshold"):
         returns = defaultdict(list)
-        for row in episodes_in(finished, arm=arm, agent="policy", at_min="0.0", over_time="False"):
+        for row in episodes_in(tiny_study, arm=arm, agent="policy", at_min="0.0", over_time="False"):
             returns[row["actor"]].append(float(row["return"]))
         assert {len(of_policy) for of_policy in returns.values()} == {5}
         means.append([np.mean(of_policy) for of_policy in returns.values()])
@@ -508,21 +501,21 @@ def test_comparisons_are_what_scipy_makes_of_the_episodes(finished: Path) -> Non
 
 
 @pytest.mark.oracle
-def test_scores_are_places_on_the_way_from_random_to_the_optimum(finished: Path) -> None:
+def test_scores_are_places_on_the_way_from_random_to_the_optimum(tiny_study: Path) -> None:
     """From the episodes and the optima themselves, not from other columns of the table."""
     arm_of = {
         "none": "without neurons",
         "1-threshold": "1-threshold",
         "9-thresholds": "9-thresholds, percentiles fixed",
     }
-    optima = {(row["mapping"], float(row["at_min"])): row for row in rows(finished / "tables/optima.csv")}
+    optima = {(row["mapping"], float(row["at_min"])): row for row in rows(tiny_study / "tables/optima.csv")}
 
     def returns_of(arm: str, agent: str, at_min: str) -> np.ndarray:
         """All have as many episodes."""
-        chosen = episodes_in(finished, arm=arm, agent=agent, at_min=at_min, over_time="False")
+        chosen = episodes_in(tiny_study, arm=arm, agent=agent, at_min=at_min, over_time="False")
         return np.array([float(row["return"]) for row in chosen])
 
-    scores = rows(finished / "tables/scores.csv")
+    scores = rows(tiny_study / "tables/scores.csv")
     assert {row["mapping"] for row in scores} == set(arm_of)
     for row in scores:
         mapping, at_min = row["mapping"], float(row["at_min"])
@@ -537,14 +530,14 @@ def test_scores_are_places_on_the_way_from_random_to_the_optimum(finished: Path)
         assert float(row["normalised_score"]) == pytest.approx((policies.mean() - random_) / (best - random_))
         error = policies.std(ddof=1) / np.sqrt(len(policies))
         assert policies.mean() < best + float(optimum["grid_error"]) + 4 * error
-    controls = rows(finished / "tables/controls.csv")
+    controls = rows(tiny_study / "tables/controls.csv")
     names = {row["control"] for row in controls if row["mapping"] == "1-threshold"}
     assert {"random", "silent", "shuffled", "heuristic", "constant 80 Hz"} <= names
 
 
 @pytest.mark.oracle
-def test_optima_have_intervals_where_arms_are_evaluated_through_thresholds(finished: Path) -> None:
-    for row in rows(finished / "tables/optima.csv"):
+def test_optima_have_intervals_where_arms_are_evaluated_through_thresholds(tiny_study: Path) -> None:
+    for row in rows(tiny_study / "tables/optima.csv"):
         assert row["left_out"] == ""
         evaluated = row["mapping"] != "none" and (row["mapping"] == "1-threshold" or float(row["at_min"]) == 140)
         assert bool(row["low_95"]) == bool(row["high_95"]) == evaluated
@@ -553,9 +546,9 @@ def test_optima_have_intervals_where_arms_are_evaluated_through_thresholds(finis
 
 
 @pytest.mark.oracle
-def test_policies_before_training_have_learned_nothing(finished: Path) -> None:
+def test_policies_before_training_have_learned_nothing(tiny_study: Path) -> None:
     trained, before = (
-        Policy.load(finished / f"policies/navigation/{slug}/p0.safetensors")
+        Policy.load(tiny_study / f"policies/navigation/{slug}/p0.safetensors")
         for slug in ("1-threshold", "before-training")
     )
     assert before.learning_curve.shape == (0, 6)
@@ -572,25 +565,25 @@ def test_no_two_arms_start_from_the_same_networks() -> None:
 
 
 @pytest.mark.oracle
-def test_simulators_are_kept_whole(finished: Path) -> None:
-    timeline = load_timeline(finished / "simulators/timeline.safetensors")
+def test_simulators_are_kept_whole(tiny_study: Path, tmp_path: Path) -> None:
+    timeline = load_timeline(tiny_study / "simulators/timeline.safetensors")
     assert timeline.start_min.tolist() == [0.0, 140.0]
     assert [c.label for c in timeline.conditions] == ["5 Hz", "10 Hz", "20 Hz", "40 Hz", "80 Hz"]
     assert float(timeline.at(0.0).percentiles[5]) > 0
-    (finished.parent / "cut").write_bytes((finished / "simulators/timeline.safetensors").read_bytes()[:50])
+    (tmp_path / "cut").write_bytes((tiny_study / "simulators/timeline.safetensors").read_bytes()[:50])
     with pytest.raises(InvalidFile, match="cut: expected simulators as animat study and animat tune write them"):
-        load_timeline(finished.parent / "cut")
+        load_timeline(tmp_path / "cut")
 
 
 @pytest.mark.oracle
 def test_the_example_of_the_page_runs(
-    finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tiny_study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     page = (Path(__file__).parents[1] / "docs" / "studies.md").read_text()
     blocks = re.findall(r"^```python\n(.*?)^```", page, re.M | re.S)
     plain, lent = blocks
     # The paper's study takes minutes; whether its example is right is seen on one that is there.
-    shutil.copytree(finished, tmp_path / "study-2")
+    shutil.copytree(tiny_study, tmp_path / "study-2")
     shutil.copytree(TINY.parent / "data" / "tiny", tmp_path / "data" / "tiny")
     monkeypatch.chdir(tmp_path)
     asked: dict[str, Any] = {}
@@ -599,7 +592,7 @@ def test_the_example_of_the_page_runs(
     assert capsys.readouterr().out.strip() == str(tmp_path / "study-2" / "report.html")
     assert paper_study(**asked).culture.seed == 2
     # Nothing is left to do in a finished folder: no process is begun.
-    shutil.copytree(finished, tmp_path / "study")
+    shutil.copytree(tiny_study, tmp_path / "study")
     exec(compile(lent, "studies.md", "exec"), {"__name__": "__main__"})
     assert asked == {"culture_seed": 2, "quick": True}
 
@@ -609,9 +602,9 @@ def test_the_example_of_the_page_runs(
 
 @pytest.mark.oracle
 @pytest.mark.filterwarnings("ignore::ResourceWarning")
-def test_no_table_or_figure_is_cut_off_in_print(browser: Any, finished: Path) -> None:
+def test_no_table_or_figure_is_cut_off_in_print(browser: Any, tiny_study: Path) -> None:
     """Tables that scroll on a screen lost their last columns on paper, and folded ones all of them."""
-    browser.get((finished / "report.html").as_uri())
+    browser.get((tiny_study / "report.html").as_uri())
 
     def size(width_px: int, height_px: int) -> None:
         asked = {"width": width_px, "height": height_px, "deviceScaleFactor": 1, "mobile": False}
@@ -640,12 +633,12 @@ def test_no_table_or_figure_is_cut_off_in_print(browser: Any, finished: Path) ->
 
 
 @pytest.mark.oracle
-def test_the_report_holds_every_figure_and_table(finished: Path) -> None:
-    page = (finished / "report.html").read_text()
+def test_the_report_holds_every_figure_and_table(tiny_study: Path) -> None:
+    page = (tiny_study / "report.html").read_text()
     expected = ["headline"] + [f"culture-{name}" for name in CULTURE] + [f"navigation-{name}" for name in ROBOT]
     for stem in expected:
         for ending in ("png", "svg", "pdf"):
-            assert (finished / "figures" / f"{stem}.{ending}").stat().st_size > 1000, stem
+            assert (tiny_study / "figures" / f"{stem}.{ending}").stat().st_size > 1000, stem
         assert f'href="figures/{stem}.svg"' in page
     # The headline has a second one for phones.
     assert page.count("<img ") == page.count("data:image/png;base64,") - 1 == len(expected)
@@ -659,7 +652,7 @@ def test_the_report_holds_every_figure_and_table(finished: Path) -> None:
     assert "provided that the files are at the same paths relative to study.toml." in page
     assert "A response to the right of the dashed threshold counts as a burst, as in the last panel." in page
     assert "before and after training, navigation" in page
-    assert {path.stem for path in (finished / "tables").glob("*.csv")} == {
+    assert {path.stem for path in (tiny_study / "tables").glob("*.csv")} == {
         "scores", "comparisons", "controls", "heuristic", "reflexes", "learning-curves", "optima", "controllability",
         "findings",
         "culture-array", "culture-psth", "culture-bursts", "culture-conditions", "culture-drift",
@@ -668,10 +661,10 @@ def test_the_report_holds_every_figure_and_table(finished: Path) -> None:
 
 
 @pytest.mark.oracle
-def test_the_numbers_of_the_culture_s_figures_are_those_of_its_recordings(finished: Path) -> None:
-    recordings = read_recordings(finished / "recordings")
+def test_the_numbers_of_the_culture_s_figures_are_those_of_its_recordings(tiny_study: Path) -> None:
+    recordings = read_recordings(tiny_study / "recordings")
     first, window_s = recordings[0], (0.002, 0.010)
-    psth = rows(finished / "tables/culture-psth.csv")
+    psth = rows(tiny_study / "tables/culture-psth.csv")
     since_s = (first.spike_times_s[:, None] - first.stimuli.time_s)[:, first.stimuli.is_last_of_presentation]
     for row in psth:
         low_s, high_s = float(row["from_ms"]) * 1e-3, float(row["to_ms"]) * 1e-3
@@ -681,9 +674,9 @@ def test_the_numbers_of_the_culture_s_figures_are_those_of_its_recordings(finish
         exposure_s = (high_s - low_s) * since_s.shape[1] * 32
         assert float(row["rate_hz_per_channel"]) == pytest.approx(spikes / exposure_s)
         assert float(row["in_window"]) == (window_s[0] - 1e-6 < low_s and high_s < window_s[1] + 1e-6)
-    drift, bursts = rows(finished / "tables/culture-drift.csv"), rows(finished / "tables/culture-bursts.csv")
-    of_condition = rows(finished / "tables/culture-conditions.csv")
-    responses = rows(finished / "simulators/responses.csv")
+    drift, bursts = rows(tiny_study / "tables/culture-drift.csv"), rows(tiny_study / "tables/culture-bursts.csv")
+    of_condition = rows(tiny_study / "tables/culture-conditions.csv")
+    responses = rows(tiny_study / "simulators/responses.csv")
     assert [row["at_min"] for row in drift] == [row["at_min"] for row in bursts] == ["0.0", "140.0"]
     for row, separated in zip(drift, bursts, strict=True):
         here = [each for each in responses if each["start_min"] == row["at_min"]]
@@ -703,7 +696,7 @@ def test_the_numbers_of_the_culture_s_figures_are_those_of_its_recordings(finish
             x = [float(r["rate_hz"]) for r in here if r["condition"] == each["condition"] and r["is_burst"] == "0"]
             assert float(each["median_hz"]) == np.median(x)
             assert float(each["above_median"]) == pytest.approx(np.mean(np.array(x) >= np.median(kept)))
-    array = rows(finished / "tables/culture-array.csv")
+    array = rows(tiny_study / "tables/culture-array.csv")
     assert [row["channel"] for row in array if row["channel"]] == first.channels.label.tolist()
     counts = [np.count_nonzero(first.spike_channels == i) for i in range(32)]
     assert [float(row["rate_hz"]) for row in array[:32]] == pytest.approx(np.array(counts) / first.duration_s)
@@ -712,12 +705,12 @@ def test_the_numbers_of_the_culture_s_figures_are_those_of_its_recordings(finish
 
 
 @pytest.mark.oracle
-def test_the_numbers_of_a_robot_s_figures_are_those_of_its_tables(finished: Path) -> None:
+def test_the_numbers_of_a_robot_s_figures_are_those_of_its_tables(tiny_study: Path) -> None:
     parts: dict[tuple[str, str], list[tuple[float, int, float]]] = defaultdict(list)
-    for row in rows(finished / "tables/learning-curves.csv"):
+    for row in rows(tiny_study / "tables/learning-curves.csv"):
         numbers = float(row["iterations"]), int(row["episodes"]), float(row["mean_return"] or 0)
         parts[row["arm"], row["policy"]].append(numbers)
-    learning = rows(finished / "tables/navigation-learning.csv")
+    learning = rows(tiny_study / "tables/navigation-learning.csv")
     # In 40 iterations of each of eight environments all of them end an episode.
     round_of = 40 * 8
     for row in learning:
@@ -737,11 +730,11 @@ def test_the_numbers_of_a_robot_s_figures_are_those_of_its_tables(finished: Path
         known = ttest_1samp(of, 0.0).confidence_interval(0.95)
         limits = Navigation(episode_limit=40).return_range
         assert [float(row["low_95"]), float(row["high_95"])] == pytest.approx(np.clip([known.low, known.high], *limits))
-    course = rows(finished / "tables/navigation-over-time.csv")
+    course = rows(tiny_study / "tables/navigation-over-time.csv")
     assert {row["arm"] for row in course} == {"before training", "1 threshold", "control"}
     for row in course:
         returns = defaultdict(list)
-        for each in episodes_in(finished, arm=row["arm"], at_min=row["at_min"], over_time="True"):
+        for each in episodes_in(tiny_study, arm=row["arm"], at_min=row["at_min"], over_time="True"):
             returns[each["actor"]].append(float(each["return"]))
         means = [np.mean(of_policy) for of_policy in returns.values()]
         quartiles = [float(row[name]) for name in ("lower_quartile", "median", "upper_quartile")]
@@ -750,19 +743,19 @@ def test_the_numbers_of_a_robot_s_figures_are_those_of_its_tables(finished: Path
 
 
 @pytest.mark.oracle
-def test_the_report_ends_with_the_study_as_a_file(finished: Path, tmp_path: Path) -> None:
-    (written,) = re.findall("<pre>(.*?)</pre>", (finished / "report.html").read_text(), re.DOTALL)
+def test_the_report_ends_with_the_study_as_a_file(tiny_study: Path, tmp_path: Path) -> None:
+    (written,) = re.findall("<pre>(.*?)</pre>", (tiny_study / "report.html").read_text(), re.DOTALL)
     (tmp_path / "study.toml").write_text(html.unescape(written))
     assert read_study(tmp_path / "study.toml") == read_study(TINY)
 
 
 @pytest.mark.oracle
-def test_the_report_asks_nothing_of_a_network(finished: Path) -> None:
-    page = (finished / "report.html").read_text()
+def test_the_report_asks_nothing_of_a_network(tiny_study: Path) -> None:
+    page = (tiny_study / "report.html").read_text()
     without_data = re.sub(r"data:image/png;base64,[A-Za-z0-9+/=]+", "", page)
     assert not re.search(r"https?:|//[a-z]|<script|<link|@import|url\(", without_data)
     for target in re.findall(r'href="([^"]+)"', without_data):
-        assert (f'id="{target[1:]}"' in page) if target.startswith("#") else (finished / target).is_file(), target
+        assert (f'id="{target[1:]}"' in page) if target.startswith("#") else (tiny_study / target).is_file(), target
 
 
 @pytest.mark.parametrize(

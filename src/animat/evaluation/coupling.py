@@ -11,8 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float64, Int
-from scipy.optimize import differential_evolution
-from scipy.stats import t as student_t
+from scipy.special import stdtrit
 
 from animat.environment import Environment, Neurons
 from animat.errors import InvalidArgument
@@ -82,6 +81,8 @@ def best_coupling(
 
     Source: Storn & Price 1997, doi:10.1023/A:1008202821328.
     """
+    from scipy.optimize import differential_evolution
+
     if isinstance(environment.robot, HostRobot):
         why = "as the search for the best coupling takes thousands of episodes"
         raise InvalidArgument(f"robot: expected one in JAX, {why}, got {environment.robot.name}")
@@ -206,7 +207,7 @@ class ContextGap:
         # For a ratio whose denominator is far from 0 relative to its error: the half widths of all parts, in
         # quadrature. With few policies tails are wide, so theirs is Student's.
         value = over / span
-        of_policies = student_t.ppf((1 + CONFIDENCE) / 2, len(returns) - 1) * error
+        of_policies = float(stdtrit(len(returns) - 1, (1 + CONFIDENCE) / 2)) * error
         spread = float(np.linalg.norm([of_policies, _Z * (1 - value) * self.standard_error, value * grid_error]))
         below = span if self.best_known is None else self.best_known - self.coupling
         value, low, high = (each / (span if each >= 0 else below) for each in (over, over - spread, over + spread))

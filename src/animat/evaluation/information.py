@@ -69,14 +69,11 @@ def goal_information(
     bits = conditional_information(actions.reshape(-1, *actions.shape[2:]), environment.n_actions)
     # The samples are the actors, or the states of a single actor.
     samples = bits.reshape(when.shape).mean(axis=1) if len(when) > 1 else bits
-    pairs = actions[..., :2].reshape(len(bits), -1, 2)
-    null = [
-        _plug_in(rng.permuted(pairs.reshape(len(bits), -1), axis=1).reshape(pairs.shape), environment.n_actions).mean()
-        for _ in range(PERMUTATIONS)
-    ]
-    # Sums of the same numbers in a different order may differ in the last bit.
-    reached = np.sum(np.array(null) >= _plug_in(pairs, environment.n_actions).mean() - 1e-9)
-    p = float((1 + reached) / (1 + PERMUTATIONS))
+    # Permutations leave H(A | s) as it is, and the entropy of two actions is 1 bit if they differ, else 0: the fewer
+    # pairs with a goal differ, the larger the estimate.
+    pairs = actions[..., :2].reshape(len(bits), -1)
+    differing = [_n_differing(rng.permuted(pairs, axis=1)) for _ in range(PERMUTATIONS)]
+    p = float((1 + np.sum(np.array(differing) <= _n_differing(pairs))) / (1 + PERMUTATIONS))
     # The number of goals is that of different observations when each state's goal is substituted at the first state.
     robots = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), states.robot)
     switched = jax.vmap(switch, (None, 0))(jax.tree.map(lambda x: x[0], robots), robots)
@@ -103,9 +100,8 @@ def conditional_information(
     return np.asarray(entropy - with_goal.mean(axis=1))
 
 
-def _plug_in(actions: Int[np.ndarray, "states goals draws"], n_actions: int) -> Float64[np.ndarray, " states"]:
-    shares = _shares(actions, n_actions)
-    return np.asarray(_entropy(shares.mean(axis=1)) - _entropy(shares).mean(axis=1))
+def _n_differing(pairs: Int[np.ndarray, "states actions"]) -> int:
+    return int(np.count_nonzero(pairs[:, ::2] != pairs[:, 1::2]))
 
 
 def _shares(actions: Int[np.ndarray, "*any draws"], n_actions: int) -> Float64[np.ndarray, "*any actions"]:

@@ -117,7 +117,7 @@ def p_of_u(u: float, n_first: int, n_second: int) -> float:
 
     Refuses an empty group, and a U that is impossible for groups of these sizes (InvalidArgument).
     """
-    from scipy.stats import norm
+    from scipy.special import ndtr
 
     if n_first < 1 or n_second < 1:
         raise InvalidArgument(f"n: expected at least 1 sample in each group, got {n_first} and {n_second}")
@@ -125,7 +125,7 @@ def p_of_u(u: float, n_first: int, n_second: int) -> float:
     if not 0 <= u <= total:
         raise InvalidArgument(f"u: expected 0 to {total} for {n_first} and {n_second} samples, got {u:g}")
     z = (abs(u - total / 2) - 0.5) / np.sqrt(total * (n_first + n_second + 1) / 12)
-    return float(min(1.0, 2 * norm.sf(z)))
+    return float(min(1.0, 2 * ndtr(-z)))
 
 
 def interquartile_mean(samples: ArrayLike, *, within: tuple[float, float] = (-math.inf, math.inf)) -> Interval:
@@ -230,9 +230,9 @@ def _exact_p(a: Float64[np.ndarray, " n"], b: Float64[np.ndarray, " m"]) -> floa
 def _shares_within(share: float, n_first: int, n_second: int) -> tuple[float, float]:
     """The smallest and the largest true share of pairs won that are compatible with the observed share."""
     from scipy.optimize import brentq
-    from scipy.stats import norm
+    from scipy.special import ndtri
 
-    z = float(norm.ppf((1 + CONFIDENCE) / 2))
+    z = float(ndtri((1 + CONFIDENCE) / 2))
     k = (n_first + n_second) / 2 - 1
 
     def against(true: float) -> float:

@@ -39,14 +39,14 @@ class LearningCurve:
 
     def mean_with_interval(self) -> Float64[np.ndarray, "3 chunks"]:
         """The mean over policies in each chunk and its 95 % interval by Student's t, NaN where too few have one."""
-        from scipy.stats import t
+        from scipy.special import stdtrit
 
         known, (lowest, highest) = np.isfinite(self.returns), self.within
         n = known.sum(axis=0)
         with np.errstate(invalid="ignore", divide="ignore"):
             mean = np.where(known, self.returns, 0.0).sum(axis=0) / n
             variance = (np.where(known, self.returns - mean, 0.0) ** 2).sum(axis=0) / (n - 1)
-            half = t.ppf((1 + CONFIDENCE) / 2, n - 1) * np.sqrt(variance / n)
+            half = stdtrit(n - 1, (1 + CONFIDENCE) / 2) * np.sqrt(variance / n)
         return np.stack([mean, np.maximum(mean - half, lowest), np.minimum(mean + half, highest)])
 
 
