@@ -198,9 +198,9 @@ def in_this_process() -> Iterator[None]:
         yield
 
 
-@pytest.fixture
+@pytest.fixture(autouse=True)
 def quick_coupling(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A best coupling from a short search, for tests of what is done with it; `test_coupling` tests the search."""
+    """A best coupling from a short search, except in processes that tests start; `test_coupling` tests the search."""
     monkeypatch.setattr("animat.evaluation.coupling.GENERATIONS", 2)
     monkeypatch.setattr("animat.evaluation.coupling.FRESH_EPISODES", 16)
 

@@ -151,7 +151,7 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path: Path) -> None:
 
 
 @pytest.mark.oracle
-@pytest.mark.usefixtures("in_this_process", "few_bootstraps", "quick_coupling")
+@pytest.mark.usefixtures("in_this_process", "few_bootstraps")
 def test_a_small_study_from_a_culture_to_its_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("animat.stimulation.protocol.CLOSED_LOOP", replace(CLOSED_LOOP, trials=40))
     study = ContextStudy(

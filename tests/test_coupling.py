@@ -23,6 +23,11 @@ from animat.neurons.synthetic import synthetic_simulator
 from animat.robots import Quantity, Robot, Wheels, robot_named
 
 
+@pytest.fixture
+def quick_coupling() -> None:
+    """None: here the search is as it is."""
+
+
 class Sensed(NamedTuple):
     at: jax.Array
 

@@ -18,6 +18,7 @@ from animat.cli import main
 from animat.coding.mapping import Thresholds
 from animat.environment import Animat
 from animat.errors import InvalidArgument, UnusableData
+from animat.evaluation import coupling
 from animat.evaluation.optimal_returns import WellSampled, _coarse, optimal_returns
 from animat.evaluation.optimum import Optimum, best_return, optimal_values
 from animat.evaluation.rollouts import Constant, Uniform, roll_out
@@ -55,7 +56,6 @@ def test_it_is_the_optimum_of_the_default_simulator_above_random_and_constant_st
 
 
 @pytest.mark.oracle
-@pytest.mark.usefixtures("quick_coupling")
 def test_inspect_reports_the_optimum(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -143,7 +143,7 @@ def test_a_condition_of_few_responses_is_left_out_by_name() -> None:
     few = {"resolution": 0.25, "episodes": 2, "resamples": 3}
     (found,) = optimal_returns(lucky, SHORT, [Thresholds(1)], progress=progress, **few)  # type: ignore[arg-type]
     # Every iteration of each grid, and every generation of the search, which may end early.
-    assert parts == sorted(parts) and len(parts) > 3 * 24 + 60 and 2 / 3 < parts[-1] <= 1
+    assert parts == sorted(parts) and len(parts) > 3 * 24 + coupling.GENERATIONS and 2 / 3 < parts[-1] <= 1
     # Of the four others, at the median of all responses, which is the threshold of commands.
     without = fit_histogram(lucky.only([0, 1, 2, 3]))
     held = replace(without, percentiles=jnp.asarray(np.percentile(lucky.rate_hz, np.arange(0, 101, 10)), jnp.float32))

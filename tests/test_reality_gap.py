@@ -1053,7 +1053,7 @@ def test_whose_work_it_is_in_a_loop(tmp_path: Path, series: list[Responses]) -> 
 
 
 @pytest.mark.oracle
-@pytest.mark.usefixtures("few_bootstraps", "quick_coupling")
+@pytest.mark.usefixtures("few_bootstraps")
 def test_the_best_coupling_runs_with_the_policies(tmp_path: Path, series: list[Responses]) -> None:
     gap, _ = run(tmp_path, series, with_controls=False, with_coupling=True)
     coupling = {row.name: row for row in gap.rows}["coupling"]

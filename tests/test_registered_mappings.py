@@ -122,7 +122,7 @@ def test_the_command_line_trains_evaluates_and_runs_it(package: Path, capsys: An
 
 
 @pytest.mark.oracle
-@pytest.mark.usefixtures("in_this_process", "quick_coupling")
+@pytest.mark.usefixtures("in_this_process")
 def test_a_study_has_conditions_with_it(package: Path) -> None:
     study = Study(
         culture=Source("files", files=("data/tiny/recording_0000_min.npz",)),

@@ -41,6 +41,7 @@ from animat.robots import (
     robot_to_dict,
 )
 from animat.robots.base import WITHOUT, lacking
+from animat.studies.optima import missing_capabilities
 from animat.studies.run import run_study
 from animat.studies.source import Source
 from animat.studies.specification import RobotSpec, Study
@@ -146,7 +147,7 @@ def test_the_command_line_trains_evaluates_and_runs_it(package: Path, capsys: An
 
 
 @pytest.mark.oracle
-@pytest.mark.usefixtures("in_this_process", "quick_coupling")
+@pytest.mark.usefixtures("in_this_process")
 def test_a_study_leaves_out_what_it_cannot_do_and_says_so(package: Path) -> None:
     robot_named(ROVER)
     study = Study(
@@ -164,6 +165,12 @@ def test_a_study_leaves_out_what_it_cannot_do_and_says_so(package: Path) -> None
     for message in lacking(robot_named("rover")).values():
         assert message in page
     assert not list((package / "study" / "figures").glob("rover-frames*"))
+
+
+def test_what_robots_of_one_kind_lack_is_said_once(package: Path) -> None:
+    robot_named(ROVER)
+    near, far = (RobotSpec(f"{gain} m", kind="rover", parameters={"gain_m": gain}) for gain in (0.1, 0.2))
+    assert missing_capabilities(Study(robots=(near, far))) == missing_capabilities(Study(robots=(near,)))
 
 
 @pytest.mark.oracle

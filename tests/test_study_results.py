@@ -426,7 +426,7 @@ second = "9 thresholds"
 
 
 @pytest.mark.oracle
-@pytest.mark.usefixtures("in_this_process", "quick_coupling")
+@pytest.mark.usefixtures("in_this_process")
 def test_a_study_of_a_real_recording_with_two_conditions(
     real_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

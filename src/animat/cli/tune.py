@@ -41,7 +41,7 @@ class TuneFile(JobOptions):
         errors = [each.standard_error for each in tuned.finals if each.standard_error]
         # The smallest standard error has two digits, unless it is only rounding.
         decimals = min(4, max(1, 1 - math.floor(math.log10(min(errors))))) if errors else 1
-        for final in sorted(tuned.finals, key=lambda each: -each.mean):
+        for final in sorted(tuned.finals, key=lambda each: (-each.mean, each.trial)):
             error = "" if final.standard_error is None else f"{final.standard_error:.{decimals}f}"
             name = names[final.trial] if final.trial < len(names) else f"trial {final.trial}"
             mean = "diverged" if final.returns is None else f"{final.mean:.{decimals}f}"

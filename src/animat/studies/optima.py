@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -56,13 +56,16 @@ def key_of(of: Arm | StudyOptimum, at_min: float) -> tuple[str, str, float]:
     return of.mapping, of.percentiles, 0.0 if of.mapping == "none" else at_min
 
 
-def missing_capabilities(study: Study) -> Iterator[str]:
+def missing_capabilities(study: Study) -> list[str]:
     """A sentence for each thing that a robot of the study cannot do, and that the study therefore lacks."""
+    sentences: list[str] = []
     for robot in dict.fromkeys(spec.robot() for spec in study.robots):
         lacks = lacking(robot)
         if (why_not := why_no_grid(robot)) is not None:
             lacks.setdefault("value_grid", f"no optimal return: {why_not}")
-        yield from lacks.values()
+        sentences.extend(lacks.values())
+    # Robots of one kind with different parameters lack the same.
+    return list(dict.fromkeys(sentences))
 
 
 @dataclass(frozen=True)

@@ -82,7 +82,10 @@ def write_results(folder: Path, tuning: Tuning, trials: Sequence[Trial], finals:
     study = with_settings(tuning.study, best.settings)
     if study.culture.kind == "files":
         study = replace(study, culture=replace(study.culture, files=(RECORDINGS,)))
-    write_whole(folder / BEST, f"# animat study {BEST}\n{study_to_toml(study)}")
+    write_whole(
+        folder / BEST,
+        f"# To run it, in the folder where animat tune was run: animat study <this file>\n{study_to_toml(study)}",
+    )
     write_whole(folder / RESULTS, json.dumps(tuned.to_dict(), indent=1) + "\n")
     robot = tuning.study.robots[0].name
     save_figure(draw_history(tuned, tuning.tune.chunks, f"Tuning on {robot}"), folder / HISTORY)
