@@ -511,6 +511,29 @@ def test_other_nwb_lasts_as_long_as_its_units_were_observed(tmp_path: Path) -> N
         assert (recording.start_s, recording.stop_s) == span_s
 
 
+def test_other_nwb_units_in_a_processing_module(tmp_path: Path) -> None:
+    """Written by PyNWB; then also twice, where one would have to be guessed."""
+    import pynwb
+
+    start = datetime.datetime(2024, 1, 1, tzinfo=datetime.UTC)
+    nwb = pynwb.NWBFile(session_description="x", identifier="x", session_start_time=start)
+    units = pynwb.misc.Units(name="sorted", description="spikes", resolution=1 / 20_000)
+    for times_s in ([0.5, 2.0], [], [1.0]):
+        units.add_unit(spike_times=times_s, obs_intervals=[[0.0, 3.0]])
+    nwb.create_processing_module(name="ecephys", description="x").add(units)
+    nwb.add_stimulus(pynwb.TimeSeries(name="pulses", data=[1.0, 1.0], timestamps=[0.1, 0.2], unit="V"))
+    with pynwb.NWBHDF5IO(str(tmp_path / "a.nwb"), "w") as nwb_io:
+        nwb_io.write(nwb)
+    recording = read_recording(tmp_path / "a.nwb")
+    assert recording.spike_times_s.tolist() == [0.5, 1.0, 2.0]
+    assert (len(recording.channels), recording.duration_s, recording.sampling_rate_hz) == (3, 3.0, 20_000)
+    with h5py.File(tmp_path / "a.nwb", "a") as file:
+        file.copy("processing/ecephys/sorted", "processing/ecephys/sorted_again")
+    words = "expected spikes in /units, found several tables of units: processing/ecephys/sorted, processing/ecephys/s"
+    with pytest.raises(InvalidFile, match=words):
+        read_recording(tmp_path / "a.nwb")
+
+
 def test_other_nwb_units_without_electrodes(tmp_path: Path) -> None:
     recording = read_recording(other_nwb(tmp_path / "a.nwb", electrodes=False))
     assert len(recording.channels) == 3

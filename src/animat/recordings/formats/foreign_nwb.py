@@ -28,40 +28,53 @@ def read_foreign_nwb(file: Hdf5File, stimuli: str | None, *, spikes: bool = True
     Units must exist; for raw traces, only channels and stimuli are read.
     """
     findings: list[Finding] = []
+    units = _units_table(file) if spikes else UNITS
     if spikes:
-        if not file.has(f"{UNITS}/spike_times"):
-            found = "none and no traces either"
-            if raw := [name for name in file.names("acquisition") if file.has(f"acquisition/{name}/data")]:
-                found = f"none: it holds traces ({some_of(raw, 4)}); find spikes in them with animat convert --raw"
-            raise InvalidFile(f"{file.path}: expected spikes in /{UNITS}, found {found}")
-        columns = _units(file, findings)
+        columns = _units(file, units, findings)
     else:
         channels = _electrodes(file) or {"channel_label": np.empty(0, np.str_)}
         columns = {"spike_time_s": np.empty(0), "spike_channel": np.empty(0, np.int64), **channels}
     columns |= read_stimuli(file, stimuli, findings)
-    columns |= _observed(file, columns["spike_time_s"], columns["stimulus_time_s"])
+    columns |= _observed(file, units, columns["spike_time_s"], columns["stimulus_time_s"])
     provenance = {"source": file.path.name, "format": "NWB of another program", **_origin(file)}
     if spikes:
         provenance["channels"] = "units"
-    resolution = file.attribute(f"{UNITS}/spike_times", "resolution")
+    resolution = file.attribute(f"{units}/spike_times", "resolution")
     if isinstance(resolution, float) and 1e-9 < resolution < 1:
         columns["sampling_rate_hz"] = 1 / resolution
     return PlainColumns(**columns).to_recording(provenance, tuple(findings))
 
 
-def _units(file: Hdf5File, findings: list[Finding]) -> dict[str, Any]:
+def _units_table(file: Hdf5File) -> str:
+    """Where the units are: in /units, or else in the only table with spike times in a processing module."""
+    if file.has(f"{UNITS}/spike_times"):
+        return UNITS
+    of_modules = [f"processing/{name}" for name in file.names("processing")]
+    tables = [f"{module}/{name}" for module in of_modules for name in file.names(module)]
+    found = [table for table in tables if file.has(f"{table}/spike_times")]
+    if len(found) == 1:
+        return found[0]
+    what = "none and no traces either"
+    if found:
+        what = f"several tables of units: {some_of(found, 4)}; write the one to use as /{UNITS} into another file"
+    elif raw := [name for name in file.names("acquisition") if file.has(f"acquisition/{name}/data")]:
+        what = f"none: it holds traces ({some_of(raw, 4)}); find spikes in them with animat convert --raw"
+    raise InvalidFile(f"{file.path}: expected spikes in /{UNITS}, found {what}")
+
+
+def _units(file: Hdf5File, at: str, findings: list[Finding]) -> dict[str, Any]:
     """The spikes, and the units as channel columns."""
-    time_s = file.read(f"{UNITS}/spike_times").reshape(-1)
-    counts = _row_lengths(file, f"{UNITS}/spike_times", len(time_s))
+    time_s = file.read(f"{at}/spike_times").reshape(-1)
+    counts = _row_lengths(file, f"{at}/spike_times", len(time_s))
     n = len(counts)
-    labels = _labels(file, UNITS, UNIT_LABELS, n)
+    labels = _labels(file, at, UNIT_LABELS, n)
     # Units follow each other; spikes count as out of order only within a unit.
     if early := sum(map(count_out_of_order, np.split(time_s, np.cumsum(counts)[:-1]))):
         findings.append(unsorted_finding("spikes", early, len(time_s)))
     order = np.argsort(time_s, kind="stable")
     columns: dict[str, Any] = {"spike_time_s": time_s[order], "channel_label": labels}
     columns["spike_channel"] = np.repeat(labels, counts)[order]
-    row, table = _electrode_of_unit(file, n), _electrodes(file)
+    row, table = _electrode_of_unit(file, at, n), _electrodes(file)
     n_electrodes = len(table.get("channel_label", ()))
     if row is None or not n_electrodes:
         message = "the units name no electrodes: positions are unknown"
@@ -74,9 +87,9 @@ def _units(file: Hdf5File, findings: list[Finding]) -> dict[str, Any]:
     return columns | {"channel_electrode": electrode, "channel_xy_um": xy_um}
 
 
-def _observed(file: Hdf5File, spike_s: Column, stimulus_s: Column) -> dict[str, float]:
+def _observed(file: Hdf5File, units: str, spike_s: Column, stimulus_s: Column) -> dict[str, float]:
     """When the recording starts and how long it is, if intervals in which units were observed cover all spikes."""
-    at = f"{UNITS}/obs_intervals"
+    at = f"{units}/obs_intervals"
     edge_s = file.read(at).astype(np.float64) if file.has(at) else np.empty(0)
     edge_s = edge_s[np.isfinite(edge_s)]
     if not len(edge_s) or not len(spike_s) or np.any(spike_s.clip(edge_s.min(), edge_s.max()) != spike_s):
@@ -86,9 +99,9 @@ def _observed(file: Hdf5File, spike_s: Column, stimulus_s: Column) -> dict[str, 
     return {"start_s": start_s, "duration_s": duration_between(start_s, float(every_s.max()))}
 
 
-def _electrode_of_unit(file: Hdf5File, n: int) -> Column | None:
+def _electrode_of_unit(file: Hdf5File, units: str, n: int) -> Column | None:
     """The first row of the electrodes table that each unit refers to, -1 for none; None without such a column."""
-    at = f"{UNITS}/electrodes"
+    at = f"{units}/electrodes"
     if not file.has(at):
         return None
     rows = file.read(at).astype(np.int64).reshape(-1)
