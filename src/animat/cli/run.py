@@ -201,7 +201,8 @@ class Run(StimulationOptions):
     ) -> tuple[Pulse, int | None, list[Finding]]:
         """The pulse and the number of patterns of the calibrating recording, else of --protocol.
 
-        If neither states a pulse, it is the usual one, with a warning; no number: it is not known.
+        If neither states a pulse, it is that of another recording, or the usual one, with a warning; no number: it is
+        not known.
         """
         from animat.cultures.kinds import pulse_for
         from animat.stimulation.protocol import CLOSED_LOOP, read_protocol

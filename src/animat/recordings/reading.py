@@ -76,7 +76,7 @@ def read_recording(
             raise InvalidArgument(f"{name}: expected finite {unit}, got {start:g}")
     source = read_source(path, stimuli_path=stimuli_path, stimuli=stimuli, part=part)
     if isinstance(source, ResponseTable):
-        reads = "animat inspect, validate, train and evaluate read, and in Python animat.read_source"
+        reads = "animat inspect, validate, train, evaluate and replay read, and in Python animat.read_source"
         raise InvalidFile(f"{path}: expected spikes, got a response table, which {reads}; this needs spike times")
     with in_file(path):
         source = source if start_s is None else with_start(source, start_s)

@@ -79,7 +79,7 @@ class HostRobot(Robot[Any]):
 
     def advance(self, uniforms: Any, state: Any, u: Any) -> Any:
         """Refused: it is stepped outside JAX."""
-        got = f"{self.name}, which only train, evaluate, run, live and studies take"
+        got = f"{self.name}, which only train, evaluate, run, live, replay and studies take"
         raise InvalidArgument(f"robot: expected one that is stepped in JAX, got {got}")
 
     def observe(self, state: Float[Array, " observations"]) -> Float[Array, " observations"]:
