@@ -107,6 +107,7 @@ def test_the_outlook_is_one_line() -> None:
         "not help; the plan is longer: ask for fewer --episodes"
     )
     assert str(Outlook(26.2, (24.0, -9.0), 20.0)).endswith("the plan is longer: ask for fewer --episodes")
+    assert "planned for about 15 s of the culture's time" in str(Outlook(0.25, None, math.inf))
     assert "in 24 min (0 min at the earliest)" in str(Outlook(26.2, (24.0, -9.0), 20.0))
     # The likely time counts, not the earliest.
     assert str(Outlook(20.0, (24.0, -9.0), math.inf)).endswith("beyond which adaptive thresholds may not help")

@@ -960,7 +960,7 @@ COMPARED = (
         ("'a\\nb' = 1", "a\\nb"),
         (f"arms = [{'{name = 1},' * 1001}]", "arms: expected at most 1,000, got 1,001"),
         (f"culture = {{files = {['a'] * 1001}}}", "culture.files: expected at most 1,000 entries, got "),
-        ("#" * 2**20 + "\n", "expected at most 1,048,576 bytes"),
+        ("#" * 2**20 + "\n", "expected a text file of at most 1,048,576 bytes, got a larger file"),
         ("[culture]\nkind = 'files'\nfiles = ['']", "culture.files: expected names of files, got ''"),
         ('[culture]\nkind = "files"\nfiles = ["a\\u0000b"]', "culture.files: expected names of files"),
         (COMPARED.format("nan"), "comparisons.at_min: expected a finite number, got nan"),

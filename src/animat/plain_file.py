@@ -58,12 +58,12 @@ def is_absent(path: Path) -> bool:
 
 def read_plain_text(path: str | os.PathLike[str], most_bytes: int) -> str:
     """The text of a file in UTF-8; raises InvalidFile if it is not a text file or too large."""
-    path = expect_plain_file(path, most_bytes)
+    path = expect_plain_file(path)
     with as_invalid_file(path), path.open("rb") as file:
         # Files that the system generates on reading have no size before.
         content = file.read(most_bytes + 1)
     if len(content) > most_bytes:
-        raise InvalidFile(f"{path}: expected at most {most_bytes:,} bytes, got more")
+        raise InvalidFile(f"{path}: expected a text file of at most {most_bytes:,} bytes, got a larger file")
     try:
         # Windows editors and spreadsheets begin UTF-8 files with a byte order mark.
         return content.decode("utf-8-sig")

@@ -40,7 +40,7 @@ class Robots(Command):
                 parameters += ", and what gymnasium.make takes for it"
             print(f"{name}: {robot['is']}\n  observes {observed}\n  parameters {parameters}")
             if robot["commands"] > 1:
-                print(f"  takes {robot['commands']} commands: use that many --readouts, or --mapping none")
+                print(f"  takes {robot['commands']} commands, each of a group of channels (--readouts), or --mapping none")
             for message in (*robot["lacks"].values(), *robot["caveats"]):
                 print(f"  {message}")
         for name, why in unusable.items():

@@ -40,7 +40,8 @@ class Outlook:
         return _BYTES_PER_MIN * min(self.planned_min, self.budget_min)
 
     def __str__(self) -> str:
-        text = f"the session is planned for about {self.planned_min:.0f} min of the culture's time; "
+        planned = f"{self.planned_min:.0f} min" if self.planned_min >= 1 else f"{60 * self.planned_min:.0f} s"
+        text = f"the session is planned for about {planned} of the culture's time; "
         available_min, remedy = self.budget_min, ""
         if self.drifted_min is None:
             text += "at least two recordings are needed to estimate the culture's drift"

@@ -123,7 +123,8 @@ def _check_claim(folder: Path, what: str, manifest: dict[str, Any], files: list[
     if found is None:
         # Hidden files do not count: they are locks, unfinished files of a killed run, or another program's.
         if folder.is_dir() and not all(path.name.startswith(".") for path in folder.iterdir()):
-            raise Mismatch(f"{folder}: expected an empty folder or one of this {what}, got one with other files in it")
+            got = "got one with other files in it; choose another folder"
+            raise Mismatch(f"{folder}: expected an empty folder or one of this {what}, {got}")
         return False
     if found["fingerprint"] == manifest["fingerprint"]:
         return all((folder / name).exists() for name in files)

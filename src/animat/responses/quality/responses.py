@@ -178,8 +178,8 @@ def _overlapping(stimuli: Stimuli, end_ms: float) -> Iterator[Finding]:
     # 1e-6 ms: an interval equal to the window's end is not shorter for being rounded.
     if overlapping := int(np.count_nonzero(read & (gap_ms < end_ms - 1e-6))):
         message = (
-            f"{overlapping} of {np.count_nonzero(read)} stimuli are followed by another pulse before their window ends "
-            f"at {end_ms:g} ms, so its artefact and response are counted in theirs: use a shorter window"
+            f"{overlapping:,} of {np.count_nonzero(read):,} stimuli are followed by another pulse before their window "
+            f"ends at {end_ms:g} ms, so its artefact and response are counted in theirs: use a shorter window"
         )
         yield Finding("stimuli-too-close", "warning", message, float(overlapping))
 
