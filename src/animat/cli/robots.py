@@ -39,8 +39,8 @@ class Robots(Command):
             if name.startswith("gymnasium:"):
                 parameters += ", and what gymnasium.make takes for it"
             print(f"{name}: {robot['is']}\n  observes {observed}\n  parameters {parameters}")
-            if robot["commands"] > 1:
-                print(f"  takes {robot['commands']} commands, each of a group of channels (--readouts), or --mapping none")
+            if (n := robot["commands"]) > 1:
+                print(f"  takes {n} commands, each from a group of channels (--readouts), or --mapping none")
             for message in (*robot["lacks"].values(), *robot["caveats"]):
                 print(f"  {message}")
         for name, why in unusable.items():
