@@ -156,13 +156,13 @@ def real_data() -> Path:
 
 
 @pytest.fixture(scope="session")
-def tiny_study(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The finished folder of `tiny_study.toml`, run once for all workers of the tests, which leave it as it is."""
+def tiny_study(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The finished folder of `tiny_study.toml`, run once for all workers of the tests, which change and lock copies."""
     from animat.studies.run import run_study
     from animat.studies.toml import read_study
 
     own, file = tmp_path_factory.getbasetemp(), Path(__file__).parent / "tiny_study.toml"
-    common = own.parent if "PYTEST_XDIST_WORKER" in os.environ else own
+    common = own.parent if hasattr(request.config, "workerinput") else own
     folder, beside = common / "tiny_study", common / "tiny_study.partial"
     with (common / "tiny_study.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)

@@ -145,7 +145,7 @@ def test_a_command_line_that_cannot_be_read_has_another_exit_status_than_other_e
 
 
 def with_a_coarse_optimum(monkeypatch: pytest.MonkeyPatch) -> list[float]:
-    """The optimal return on a coarse grid, and a short search for the coupling; returns the resolutions asked for."""
+    """The optimal return on a coarse grid; returns the resolutions asked for."""
     asked = []
 
     def coarse(*case: Any, resolution: float, **options: Any) -> Optimum:
@@ -159,7 +159,6 @@ def with_a_coarse_optimum(monkeypatch: pytest.MonkeyPatch) -> list[float]:
 
     monkeypatch.setattr("animat.evaluation.table.best_return", coarse)
     monkeypatch.setattr(WellSampled, "with_interval", narrow)
-    monkeypatch.setattr("animat.evaluation.coupling.GENERATIONS", 4)
     return asked
 
 

@@ -130,6 +130,14 @@ def test_the_permutation_null_holds_at_five_percent(monkeypatch: pytest.MonkeyPa
     assert abs(p.mean() - 0.5125) < 4 * 0.29 / np.sqrt(200)
 
 
+def test_pairs_are_of_one_goal_and_ties_count_as_reached(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert information._n_differing(np.array([[0, 1, 1, 1], [2, 2, 0, 1]])) == 2
+    monkeypatch.setattr(information, "PERMUTATIONS", 19)
+    # Of the same action everywhere, every permutation is as good as what was seen.
+    constant = Choosing(jnp.asarray(of_both(np.tile(np.eye(3)[0], (4, 1)))[None], jnp.float32))
+    assert goal_information(ENVIRONMENT, None, constant, draws=2).p == 1.0
+
+
 def test_what_has_one_goal_or_continuous_actions_has_none() -> None:
     actors = Choosing(jnp.asarray(CASES["blind"][None], jnp.float32))
     with pytest.raises(InvalidArgument, match="cartpole has no method `with_goal_of`"):

@@ -528,10 +528,25 @@ def test_other_nwb_units_in_a_processing_module(tmp_path: Path) -> None:
     assert recording.spike_times_s.tolist() == [0.5, 1.0, 2.0]
     assert (len(recording.channels), recording.duration_s, recording.sampling_rate_hz) == (3, 3.0, 20_000)
     with h5py.File(tmp_path / "a.nwb", "a") as file:
+        for elsewhere in ("processing/ecephys/LFP", "processing/behaviour", "acquisition/raw"):
+            file[elsewhere] = h5py.ExternalLink("other.nwb", "/LFP")
+    assert read_recording(tmp_path / "a.nwb").spike_times_s.tolist() == [0.5, 1.0, 2.0]
+    with h5py.File(tmp_path / "a.nwb", "a") as file:
         file.copy("processing/ecephys/sorted", "processing/ecephys/sorted_again")
-    words = "expected spikes in /units, found several tables of units: processing/ecephys/sorted, processing/ecephys/s"
+    words = "found several tables of units: processing/ecephys/sorted, processing/ecephys/sorted_again; link the one"
     with pytest.raises(InvalidFile, match=words):
         read_recording(tmp_path / "a.nwb")
+
+
+def test_other_nwb_with_links_to_other_files(tmp_path: Path) -> None:
+    """They do not matter where stimuli are found; else they are refused, as stimuli could be among them."""
+    for name, stimuli in (("with.nwb", ("pulses",)), ("without.nwb", ())):
+        with h5py.File(other_nwb(tmp_path / name, stimuli=stimuli), "a") as file:
+            file["acquisition/raw"] = h5py.ExternalLink("other.nwb", "/acquisition/raw")
+    recording = read_recording(tmp_path / "with.nwb")
+    assert (recording.stimuli.time_s.tolist(), recording.spike_times_s.tolist()) == ([0.25, 0.75], [0.5, 1.0, 2.0])
+    with pytest.raises(InvalidFile, match="acquisition/raw is a link to another file"):
+        read_recording(tmp_path / "without.nwb")
 
 
 def test_other_nwb_units_without_electrodes(tmp_path: Path) -> None:

@@ -231,10 +231,12 @@ def test_what_a_killed_run_was_writing_is_cleared_away_and_nothing_else(tiny_stu
 
 
 @pytest.mark.oracle
-def test_a_second_run_in_a_folder_at_work_is_refused(tiny_study: Path) -> None:
-    with exclusive_lock(tiny_study), pytest.raises(Mismatch, match="another run is at work in this folder"):
-        run_study(read_study(TINY), tiny_study, base=TINY.parent)
-    assert run_study(read_study(TINY), tiny_study, base=TINY.parent).done_now == {}
+def test_a_second_run_in_a_folder_at_work_is_refused(tiny_study: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "study"
+    shutil.copytree(tiny_study, folder)
+    with exclusive_lock(folder), pytest.raises(Mismatch, match="another run is at work in this folder"):
+        run_study(read_study(TINY), folder, base=TINY.parent)
+    assert run_study(read_study(TINY), folder, base=TINY.parent).done_now == {}
 
 
 @pytest.mark.oracle

@@ -49,17 +49,17 @@ def _units_table(file: Hdf5File) -> str:
     """Where the units are: in /units, or else in the only table with spike times in a processing module."""
     if file.has(f"{UNITS}/spike_times"):
         return UNITS
-    of_modules = [f"processing/{name}" for name in file.names("processing")]
-    tables = [f"{module}/{name}" for module in of_modules for name in file.names(module)]
+    modules = [f"processing/{name}" for name in file.own_names("processing")]
+    tables = [f"{module}/{name}" for module in modules for name in file.own_names(module)]
     found = [table for table in tables if file.has(f"{table}/spike_times")]
     if len(found) == 1:
         return found[0]
     what = "none and no traces either"
     if found:
-        what = f"several tables of units: {some_of(found, 4)}; write the one to use as /{UNITS} into another file"
-    elif raw := [name for name in file.names("acquisition") if file.has(f"acquisition/{name}/data")]:
+        what = f"several tables of units: {some_of(found, 4)}; link the one to use as /{UNITS}"
+    elif raw := [name for name in file.own_names("acquisition") if file.has(f"acquisition/{name}/data")]:
         what = f"none: it holds traces ({some_of(raw, 4)}); find spikes in them with animat convert --raw"
-    raise InvalidFile(f"{file.path}: expected spikes in /{UNITS}, found {what}")
+    raise InvalidFile(f"{file.path}: expected spikes in /{UNITS} or in a processing module, found {what}")
 
 
 def _units(file: Hdf5File, at: str, findings: list[Finding]) -> dict[str, Any]:

@@ -70,6 +70,11 @@ class Hdf5File:
         node = self.node(where)
         return sorted(node) if isinstance(node, h5py.Group) else []
 
+    def own_names(self, where: str) -> list[str]:
+        """As `names`, without what is linked from other files."""
+        group: Any = self.node(where)
+        return [name for name in self.names(where) if not isinstance(group.get(name, getlink=True), h5py.ExternalLink)]
+
     def has(self, where: str) -> bool:
         """Whether there is a group or dataset at a path."""
         return self.node(where) is not None

@@ -60,12 +60,12 @@ def read_stimuli(file: Hdf5File, asked: str | None, findings: list[Finding]) -> 
 
 def _find_stimuli(file: Hdf5File, asked: str | None, findings: list[Finding]) -> str | None:
     """Where the stimuli are: where asked, in /stimulus/presentation, or elsewhere under a name that mentions them."""
-    first = [f"{FIRST}/{name}" for name in file.names(FIRST)]
-    rooms = [*ELSEWHERE, *(f"processing/{module}" for module in file.names("processing"))]
-    elsewhere = [f"{room}/{name}" for room in rooms for name in file.names(room)]
+    first = [f"{FIRST}/{name}" for name in file.own_names(FIRST)]
+    rooms = [*ELSEWHERE, *(f"processing/{module}" for module in file.own_names("processing"))]
+    elsewhere = [f"{room}/{name}" for room in rooms for name in file.own_names(room)]
     # What holds series, such as BehavioralEvents.
     holders = [at for at in elsewhere if str(file.attribute(at, "neurodata_type")).startswith("Behavioral")]
-    elsewhere += [f"{holder}/{name}" for holder in holders for name in file.names(holder)]
+    elsewhere += [f"{holder}/{name}" for holder in holders for name in file.own_names(holder)]
     first, elsewhere = ([at for at in places if _can_be_stimuli(file, at)] for places in (first, elsewhere))
     if asked is not None:
         every = [*first, *elsewhere]
@@ -77,6 +77,10 @@ def _find_stimuli(file: Hdf5File, asked: str | None, findings: list[Finding]) ->
         return choose(f"{file.path}: stimuli named {asked}", "--stimuli", named, None)
     named = [at for at in elsewhere if STIMULUS_NAME.search(at.rpartition("/")[2])]
     candidates = first or named or [at for at in elsewhere if _onset_column(file, at) is not None]
+    if not candidates:
+        # What is linked from other files could be stimuli: it is refused.
+        for at in [f"{room}/{name}" for room in (FIRST, "processing", *rooms) for name in file.names(room)]:
+            file.node(at)
     # Regular samples and epochs are hardly ever stimuli.
     perhaps = [at for at in elsewhere if not (file.has(f"{at}/starting_time") or at.endswith("/epochs"))]
     if not candidates and perhaps:
