@@ -228,7 +228,10 @@ def test_another_programs_files_are_refused(tmp_path: Path) -> None:
     start = datetime.datetime(2024, 1, 1, tzinfo=datetime.UTC)
     with pynwb.NWBHDF5IO(str(tmp_path / "b.nwb"), "w") as nwb_io:
         nwb_io.write(pynwb.NWBFile(session_description="x", identifier="x", session_start_time=start))
-    with pytest.raises(InvalidFile, match=r"b\.nwb: expected spikes in /units or in a processing module, found none and no traces either"):
+    with pytest.raises(
+        InvalidFile,
+        match=r"b\.nwb: expected spikes in /units or in a processing module, found none and no traces either",
+    ):
         read_recording(tmp_path / "b.nwb")
 
 
