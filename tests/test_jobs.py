@@ -143,7 +143,8 @@ def test_the_share_done_counts_jobs_of_earlier_runs(tmp_path: Path) -> None:
     run([first, joined("b", "a", takes_s=0.5)], tmp_path, progress=kept)
     assert min(done / total for done, total, _ in kept.updates) >= 0.75
     assert kept.updates[-1][:2] == (4.0, 4.0)
-    assert kept.updates[0][2].startswith("1 of 2 jobs")
+    # Before it reports itself, or, on a busy machine, after that.
+    assert kept.updates[0][2] in ("1 of 2 jobs", "1 of 2 jobs; b 50 % half")
 
 
 def test_what_is_planned_and_what_it_costs_is_in_a_file_until_all_is_done(tmp_path: Path) -> None:

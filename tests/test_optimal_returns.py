@@ -18,7 +18,6 @@ from animat.cli import main
 from animat.coding.mapping import Thresholds
 from animat.environment import Animat
 from animat.errors import InvalidArgument, UnusableData
-from animat.evaluation import coupling
 from animat.evaluation.optimal_returns import WellSampled, _coarse, optimal_returns
 from animat.evaluation.optimum import Optimum, best_return, optimal_values
 from animat.evaluation.rollouts import Constant, Uniform, roll_out
@@ -134,7 +133,8 @@ def test_three_responses_promise_nothing() -> None:
 
 
 @pytest.mark.oracle
-def test_a_condition_of_few_responses_is_left_out_by_name() -> None:
+def test_a_condition_of_few_responses_is_left_out_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("animat.evaluation.coupling.GENERATIONS", 60)
     responses = answers([60, 60, 60, 60, 3], 2)
     # The three responses to 80 Hz are lucky: taken at face value, they would make the best condition.
     lucky = replace(responses, rate_hz=np.where(responses.condition == 4, 1000.0, responses.rate_hz))
@@ -142,8 +142,8 @@ def test_a_condition_of_few_responses_is_left_out_by_name() -> None:
     progress = SimpleNamespace(update=lambda done, total, note="": parts.append(done / total))
     few = {"resolution": 0.25, "episodes": 2, "resamples": 3}
     (found,) = optimal_returns(lucky, SHORT, [Thresholds(1)], progress=progress, **few)  # type: ignore[arg-type]
-    # Every iteration of each grid, and every generation of both searches for each kind: two are too few to end early.
-    assert parts == sorted(parts) and len(parts) > 3 * 24 + 2 * 2 * coupling.GENERATIONS and parts[-1] == 1
+    # Every iteration of each grid, and every generation of the search, which may end early.
+    assert parts == sorted(parts) and len(parts) > 3 * 24 + 60 and 2 / 3 < parts[-1] <= 1
     # Of the four others, at the median of all responses, which is the threshold of commands.
     without = fit_histogram(lucky.only([0, 1, 2, 3]))
     held = replace(without, percentiles=jnp.asarray(np.percentile(lucky.rate_hz, np.arange(0, 101, 10)), jnp.float32))

@@ -145,7 +145,7 @@ def test_periods_instead_of_frequencies_cause_a_warning(tmp_path: Path) -> None:
 def test_only_commands_that_need_spikes_refuse_a_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     np.savez(tmp_path / "a.npz", response_count=[[1, 0], [0, 0]])
     assert main(["convert", str(tmp_path / "a.npz"), "--out", str(tmp_path / "b.nwb")]) == 1
-    reads = "a response table, which animat inspect, validate, train, evaluate and replay read"
+    reads = "got a response table, which animat inspect, validate, train, evaluate and replay read"
     assert reads in capsys.readouterr().err
     with pytest.raises(InvalidFile, match="this needs spike times"):
         read_recording(tmp_path / "a.npz")

@@ -180,7 +180,11 @@ def test_the_best_is_a_study_of_the_settings_that_won(finished: Path) -> None:
     study = read_study(finished / BEST)
     tiny = with_settings(read_tuning(TINY).study, best["settings"])
     assert study == replace(tiny, culture=Source("files", files=("recordings",)))
-    assert (finished / BEST).read_text().startswith("# To run it, in the folder where animat tune was run: ")
+    assert (
+        (finished / BEST)
+        .read_text()
+        .startswith("# To run it, in the folder where animat tune was run: animat study <this file>\n")
+    )
 
 
 def test_a_finished_folder_is_reported_again_and_nothing_is_trained(finished: Path) -> None:
